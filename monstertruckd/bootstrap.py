@@ -90,7 +90,10 @@ def main(arguments: list[str]) -> int:
 
 def compile_kernels() -> int:
     """Compile what goals and maps need; the exit code."""
-    print("Step 2 of 3: kernels of planners and mapping: seconds, the first time a minute or two ...", file=sys.stderr)
+    print(
+        "Step 2 of 3: compiling the kernels of planners and mapping: seconds, a minute or two the first time ...",
+        file=sys.stderr,
+    )
     return run(*KERNELS)
 
 
@@ -115,17 +118,17 @@ def sync(extras: tuple[str, ...]) -> None:
     environment = {name: value for name, value in os.environ.items() if name != "VIRTUAL_ENV"}
     if not VENV.exists():
         size = "a gigabyte or two" if extras == EXTRAS["sync"] else "about 800 MB"
-        print(f"Step 1 of 3: packages into {VENV}: {size}, the first time only ...", file=sys.stderr)
+        print(f"Step 1 of 3: installing packages into {VENV}: {size}, the first time only ...", file=sys.stderr)
     code = subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode
     if code:
-        raise SystemExit(f"uv could not set up {VENV}: the reason is above; the command can be run again.")
+        raise SystemExit(f"uv could not set up {VENV} for the reason above; run the command again.")
 
 
 def find_uv() -> str:
     """Path of the pinned ``uv``: in the user's cache, or the machine's own if it is that very program, else fetched."""
     machine = platform.machine()
     if machine not in PROGRAM_SHA256 or platform.libc_ver()[0] != "glibc":
-        raise SystemExit(f"{machine} is not supported: x86_64 and aarch64 Linux with glibc >= 2.28 are.")
+        raise SystemExit(f"{machine} is not supported: expected x86_64 or aarch64 Linux with glibc >= 2.28.")
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "monstertruckd"
     target = cache / f"uv-{UV_VERSION}"
     own = shutil.which("uv")
@@ -136,9 +139,11 @@ def find_uv() -> str:
     try:
         program = fetch_uv(machine)
     except OSError as error:
-        raise SystemExit(f"uv {UV_VERSION} cannot be fetched: {error}. Is the package index in reach?") from None
+        raise SystemExit(
+            f"uv {UV_VERSION} cannot be fetched: {error}. Check that the package index is reachable."
+        ) from None
     if sha256(program) != PROGRAM_SHA256[machine]:
-        raise SystemExit(f"uv {UV_VERSION}: the program in the wheel has another sha256; not used.")
+        raise SystemExit(f"uv {UV_VERSION}: the program in the wheel has a different sha256 and is not used.")
     try:
         cache.mkdir(parents=True, exist_ok=True)
         scratch = target.with_suffix(f".{os.getpid()}")
@@ -147,7 +152,7 @@ def find_uv() -> str:
         scratch.replace(target)
     except OSError as error:
         reason = f"{cache} cannot be written: {error.strerror}"
-        raise SystemExit(f"{reason}. Name a folder of yours: XDG_CACHE_HOME=FOLDER") from None
+        raise SystemExit(f"{reason}. Choose a folder of yours: XDG_CACHE_HOME=FOLDER") from None
     return str(target)
 
 
@@ -169,7 +174,7 @@ def fetch_uv(machine: str) -> bytes:
     with urllib.request.urlopen(urllib.parse.urljoin(page_url, found[1]), timeout=300) as reply:
         wheel = reply.read()
     if sha256(wheel) != WHEEL_SHA256[machine]:
-        raise SystemExit(f"uv {UV_VERSION}: what {found[1]} sent has another sha256; not used.")
+        raise SystemExit(f"uv {UV_VERSION}: the file from {found[1]} has a different sha256 and is not used.")
     with zipfile.ZipFile(io.BytesIO(wheel)) as archive:
         name = next(name for name in archive.namelist() if name.endswith("/scripts/uv"))
         return archive.read(name)

@@ -68,7 +68,7 @@ from monstertruckd.recorder.black_box import BlackBox
 from monstertruckd.recorder.recorder import LogDigest, Recorder
 from monstertruckd.recorder.recordings import Recordings
 
-STOPPED: Final = "the emergency stop is latched until you clear it"
+STOPPED: Final = "the emergency stop is latched until an operator resets it"
 """Consequence of a file that is left out."""
 
 
@@ -136,9 +136,7 @@ class Daemon:
         """Publishes the poses received from other robots."""
         self._remote_steps = RemoteWorkQueue(CODEC)
         if config.placement.slowness is not None and not isinstance(clock, VirtualClock):
-            raise ConfigError(
-                "placement.slowness: for studies on the virtual clock only, not for a daemon in real time"
-            )
+            raise ConfigError("placement.slowness: supported on the virtual clock only, not for a daemon in real time")
         self.slow: SlowComputer | None = None
         """Delays all computations in a study (``placement.slowness``)."""
         self._actors = ActorFactory(clock, self._remote_steps)
@@ -354,7 +352,7 @@ class Daemon:
         self.gate.configure(config.gate, config.weakened())
 
     def _refuse_goal(self, request: GoalRequest) -> None:
-        why = "this robot follows paths, it has no planner that finds one"
+        why = "this robot follows given paths and has no planner to find a route"
         if self.config.planner is not None:
             why = "ROS 2 plans for this robot (planner.mode ros2): send the goal to Nav2"
         text = f"goal of {request.source} refused: {why}"
@@ -488,7 +486,7 @@ def acknowledging(events: EventSink) -> Handler:
         text, by = payload.get("text"), str(payload.get("source", ""))
         if not isinstance(text, str) or not text or len(text) > longest_warning or not text.isprintable():
             raise InputError(f"text: expected 1 to {longest_warning} printable characters")
-        events(Reason.ACKNOWLEDGED, Severity.INFO, "operator", f"{by} has seen: {text}", by=by)
+        events(Reason.ACKNOWLEDGED, Severity.INFO, "operator", f"{by} acknowledged: {text}", by=by)
         return {}
 
     return acknowledge

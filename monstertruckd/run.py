@@ -38,12 +38,12 @@ def run_daemon(config_file: Path, *, verbose: bool) -> Reason:
     listener = start_logging(verbose=verbose)
     log.info("calibration: %s", tree.calibration or f"none in {config.calibration_folder}")
     if tree.unused:
-        text = "%s: not used, as the configuration has no such part: %s"
+        text = "%s: ignored, because the configuration has no such part: %s"
         log.warning(text, tree.calibration, ", ".join(tree.unused))
     clean_up(config)
     for table in TABLES:
         for broken in table.broken:
-            log.warning("plug-in left out: %s", broken)
+            log.warning("plug-in skipped: %s", broken)
 
     async def main(clock: Clock) -> None:
         stop = asyncio.Event()
@@ -75,6 +75,6 @@ def clean_up(config: TruckConfig) -> None:
     for clean, folder in folders:
         try:
             for file in clean(folder):
-                log.info("%s: removed; a program was killed while it wrote it", file)
+                log.info("%s: removed, left by a program that was killed while writing it", file)
         except OSError as error:
             log.warning("%s: files of killed programs cannot be removed: %s", folder, error.strerror)

@@ -209,7 +209,7 @@ def wrong_sonar(rng: np.random.Generator) -> Found:
     crossed = {**places, first: places[second], second: places[first]}
     legs = sonar_legs(crossed, (1.7 + rng.uniform(-0.05, 0.05), rng.uniform(-0.06, 0.06)), 0.43, 1.0, rng, 3.5)
     said = complaint(lambda: sonar.result_of(legs, settings, 1.7, 0.002))
-    return said if f"{first} hears the echoes due at {second}" in said else ""
+    return said if f"{first} receives the echoes expected at {second}" in said else ""
 
 
 def wrong_stabiliser(rng: np.random.Generator) -> Found:

@@ -1,4 +1,4 @@
-"""The device's side of a cable, for emulators: its end of the bytes, line faults, ports in memory and on ptys."""
+"""Device side of a cable, for emulators: its byte streams, line faults, ports in memory and on ptys."""
 
 import asyncio
 import contextlib
@@ -25,8 +25,8 @@ FRAME: Final = 0.001
 class DeviceEnd:
     """Device side of a port, which an emulator reads and writes, whichever process has the host side open.
 
-    Bytes without a reader are dropped, as with a USB device. ``baud`` paces both directions like a real
-    line (10 bits a byte). Faults of the cable live here too.
+    Bytes without a reader are dropped, as with a USB device. ``baud`` paces both directions like a real line (10 bits
+    per byte). It also injects cable faults.
     """
 
     def __init__(self, name: str) -> None:
@@ -43,14 +43,14 @@ class DeviceEnd:
         self._deliver: Callable[[bytes], None] | None = None
 
     def connect(self, deliver: Callable[[bytes], None] | None) -> None:
-        """A host opened the port (or closed it: None)."""
+        """A host opened the port, or closed it (None)."""
         self._deliver = deliver
 
     async def read(self, within: float | None = None) -> bytes:
-        """Bytes from the host, at least one; waits forever while nothing is plugged in or open.
+        """Wait for bytes from the host, at least one, even while unplugged or closed.
 
         Raises:
-            TimeoutError: nothing came ``within`` that many seconds.
+            TimeoutError: no byte within ``within`` seconds.
         """
         return await self._received.read(within)
 
@@ -60,12 +60,12 @@ class DeviceEnd:
             self._send(self._out, len(chunk), partial(self._emit, chunk), after)
 
     def take(self, data: bytes) -> None:
-        """Bytes from the host enter the line."""
+        """Put bytes from the host on the line."""
         data = self.faults.shorten(data)
         self._send(self._in, len(data), partial(self._accept, data))
 
     def _send(self, direction: "_Direction", count: int, arrive: Callable[[], None], after: float = 0.0) -> None:
-        """Let ``count`` bytes arrive when those before them and they themselves are through."""
+        """Deliver ``count`` bytes after all earlier ones and their own transfer time."""
         delay = self.faults.delay + after
         if self.baud is None and delay <= 0 and direction.is_free():
             arrive()
@@ -86,7 +86,7 @@ class DeviceEnd:
 
 
 CABLE: Final = contextvars.Context()
-"""Context of bytes in transit: they arrive whatever their sender does meanwhile."""
+"""Context of bytes in transit: they arrive even if their sender is cancelled."""
 
 
 class _Direction:
@@ -102,7 +102,7 @@ class _Direction:
 
     def enter(self, delay: float, duration: float, arrive: Callable[[], None]) -> None:
         loop = asyncio.get_running_loop()
-        # Apart by 0.1 us, lest two of them arrive in one turn of the virtual loop.
+        # 0.1 us apart, so that they do not arrive in the same iteration of the virtual loop.
         self._free = max(self._free + 1e-7, loop.time() + delay) + duration
         self._sent.append(arrive)
         loop.call_at(self._free, self._arrive, context=CABLE)
@@ -112,17 +112,17 @@ class _Direction:
 
 
 class LineFaults:
-    """What can be wrong with a cable; all off by default. Randomness is set by ``seed``."""
+    """Faults of a cable; all off by default. ``seed`` sets the random numbers."""
 
     def __init__(self) -> None:
         self.stalled = False
-        """Nothing reaches the host."""
+        """Whether no byte reaches the host."""
         self.deaf = False
-        """Nothing reaches the device."""
+        """Whether no byte reaches the device."""
         self.delay = 0.0
         """Seconds added to every transfer."""
         self.chunk: int | None = None
-        """Deliver at most this many bytes at a time (1 = one-byte reads)."""
+        """Maximum number of bytes delivered at a time (1: one-byte reads)."""
         self.flip_rate = 0.0
         """Probability that one bit of a byte is flipped."""
         self.drop_rate = 0.0
@@ -132,13 +132,13 @@ class LineFaults:
         self.double_rate = 0.0
         """Probability that a whole message of the device is sent twice."""
         self.garbage = b""
-        """Sent once before the next bytes."""
+        """Bytes sent once before the next ones."""
         self.short_writes = 0
-        """So many of the host's next writes of several bytes end half-way."""
+        """Number of the host's next multi-byte writes that are truncated."""
         self._state = 0x9E3779B9
 
     def seed(self, seed: int) -> None:
-        """Make the faults reproducible."""
+        """Seed the random faults."""
         self._state = (seed * 2654435761 + 1) & 0xFFFFFFFF
 
     def corrupt(self, data: bytes) -> list[bytes]:
@@ -161,7 +161,7 @@ class LineFaults:
         return [data[i : i + self.chunk] for i in range(0, len(data), self.chunk)]
 
     def shorten(self, data: bytes) -> bytes:
-        """What of one write of the host enters the line."""
+        """Bytes of one host write that enter the line."""
         if self.short_writes <= 0 or len(data) < 2:
             return data
         self.short_writes -= 1
@@ -184,7 +184,7 @@ class EmulatedPort(Protocol):
         """Connect the cable."""
 
     def unplug(self) -> None:
-        """Pull the cable: the host's link is lost."""
+        """Unplug the cable: the host's link is lost."""
 
 
 class MemoryPort:
@@ -204,7 +204,7 @@ class MemoryPort:
                 self.device.on_plug(True)
 
     def unplug(self) -> None:
-        """Pull the cable: an open link is lost."""
+        """Unplug the cable: an open link is lost."""
         if self._plugged:
             self._plugged = False
             self.device.connect(None)
@@ -218,8 +218,8 @@ class MemoryPort:
         """Open the host side.
 
         Raises:
-            DeviceLostError: nothing is plugged in.
-            PortBusyError: it is open already.
+            DeviceLostError: unplugged.
+            PortBusyError: it is already open.
         """
         if not self._plugged:
             raise DeviceLostError(f"{self.name}: not plugged in")
@@ -243,14 +243,14 @@ def reserved(*links: Path) -> Iterator[None]:
         links: symlinks to create; their folders must exist.
 
     Raises:
-        BusyError: another program serves one of them; the text gives its process.
-        InputError: the name belongs to something other than a link.
+        BusyError: another program serves one of them; the text names its process.
+        InputError: the name exists and is not a link.
         OSError: the link cannot be created.
     """
     with contextlib.ExitStack() as stack:
         for link in links:
             if os.path.lexists(link) and not link.is_symlink():
-                raise InputError(f"{link}: is there already, and no link: a pty does not take its place")
+                raise InputError(f"{link}: already exists and is not a link, so a pty cannot replace it")
             lock = link.with_name(f".{link.name}.lock")
             try:
                 file = stack.enter_context(lock.open("a+"))  # keeps the holder's text
@@ -271,7 +271,7 @@ def reserved(*links: Path) -> Iterator[None]:
 
 
 class PtyPort:
-    """A pty behind a stable symlink; unplugging closes it, replugging makes a new one.
+    """A pty behind a stable symlink; unplugging closes it, replugging creates a new one.
 
     Args:
         path: symlink to create; its folder must exist.
@@ -286,7 +286,7 @@ class PtyPort:
         self._timer: asyncio.TimerHandle | None = None
 
     def plug(self) -> None:
-        """Create the pty, raw, and point the symlink at it. Needs a running loop."""
+        """Create the pty in raw mode and point the symlink at it. Needs a running loop."""
         if self._fds is not None:
             return
         master, slave = os.openpty()
@@ -322,7 +322,7 @@ class PtyPort:
 
     def _readable(self) -> None:
         assert self._fds is not None
-        # The slave stays open on our side, so EIO cannot come while we are plugged.
+        # The slave stays open on this side, so EIO cannot occur while plugged in.
         with contextlib.suppress(BlockingIOError):
             self.device.take(os.read(self._fds[0], 4096))
 
@@ -336,23 +336,23 @@ class PtyPort:
         self._timer = None
         frame = bytes(self._frame)
         self._frame.clear()
-        # Bytes beyond a pty's capacity of about 10 kB are lost, like bytes of a USB device not fetched in time.
+        # Bytes beyond a pty's capacity of about 10 kB are lost, like unread bytes of a USB device.
         with contextlib.suppress(BlockingIOError):
             os.write(self._fds[0], frame)
 
 
 class SocketPort:
-    """A device on the network, emulated at an address of this computer; it serves one client at a time.
+    """A network device, emulated at an address of this computer; it serves one client at a time.
 
-    Unplugged it is silent, as behind a cable that is pulled. Plugged in again it comes up as after a loss of its supply
-    and resets the connection from before.
+    Unplugged, it is silent, as with a pulled cable. Plugged in again, it behaves as after a power loss and resets the
+    earlier connection.
 
     Args:
         address: address of 127.0.0.0/8.
-        number: TCP port; 0 = any free one.
+        number: TCP port; 0: any free one.
 
     Raises:
-        BusyError: another program has the port.
+        BusyError: another program uses the port.
         OSError: this computer has no such address.
     """
 
@@ -383,7 +383,7 @@ class SocketPort:
             self.device.on_plug(True)
 
     def unplug(self) -> None:
-        """Pull the cable: the host hears nothing any more."""
+        """Unplug the cable: the host receives nothing any more."""
         if not self._plugged:
             return
         self._plugged = False
@@ -396,14 +396,14 @@ class SocketPort:
             self.device.on_plug(False)
 
     def close(self) -> None:
-        """Give the address up."""
+        """Release the address."""
         self.unplug()
         self._drop()
         self._listener.close()
 
     def _accept(self) -> None:
         if self._client is not None:
-            self._readable()  # its end may have come before the newcomer
+            self._readable()  # its end may have come before the new client
         client = self._next_client()
         if client is None:
             return
@@ -417,7 +417,7 @@ class SocketPort:
         self.device.connect(self._send)
 
     def _next_client(self) -> socket.socket | None:
-        """A client that waits; None if none does."""
+        """Return a waiting client; None if there is none."""
         try:
             return self._listener.accept()[0]
         except BlockingIOError:

@@ -39,7 +39,7 @@ class Duty(StrEnum):
     """Purpose of a device on the truck."""
 
     ACTUATOR = "actuator"
-    """Carries out the gate's commands; outlives the gate, and a bug in its driver ends the daemon."""
+    """Executes the gate's commands; outlives the gate, and a bug in its driver ends the daemon."""
     SENSOR = "sensor"
     MONITOR = "monitor"
     """Reads the computer's own files; configured under ``monitors``."""
@@ -57,23 +57,25 @@ class RoleSpec:
     """Topics by the driver's parameter. The first is the role's main topic; any other is left out (the driver gets
     None) if it is the main topic of another configured device."""
     reads: Mapping[str, Topic[Any]] = field(default_factory=dict)
-    """Topics whose latest message the driver gets, by the driver's parameter."""
+    """Topics whose latest message is passed to the driver, by the driver's parameter."""
     frame: bool = False
-    """Whether its mount is in the tree of frames."""
+    """Whether the tree of frames contains its mount."""
     elements: str | None = None
-    """Field of the driver's settings with several sensing elements by name: their mounts are in the tree of frames, as
-    ``<role>_<name>``."""
+    """Field of the driver's settings with several sensing elements by name; the tree of frames contains their mounts as
+    ``<role>_<name>``.
+    """
     start: int = 11
-    """Rank among the devices that start again behind a returned hub: by default with the sensors, before what loads the
-    hub."""
+    """Rank among the devices that restart after their hub returned: by default with the sensors, before devices that
+    load the hub.
+    """
     shafts: tuple[int, ...] = ()
-    """Driven shafts it may control, of those as many as its settings have (``shafts``); else the first one."""
+    """Driven shafts it may control, limited to the number in its settings (``shafts``); otherwise the first one."""
     loads_hub: bool = False
     """Whether it draws current (a motor, an image sensor) or bandwidth as soon as its driver starts it."""
 
     @property
     def topic(self) -> Topic[Any]:
-        """Its own topic."""
+        """Its main topic."""
         return next(iter(self.writes.values()))
 
 
@@ -82,7 +84,7 @@ def _shaft(index: int) -> RoleSpec:
     return RoleSpec(
         name=SHAFTS[index].value,
         duty=Duty.ACTUATOR,
-        doc=f"Controller of the body's {ordinal} driven shaft{', if it has one' if index else ''}",
+        doc=f"Controller of the body's {ordinal} driven shaft{' (optional)' if index else ''}",
         writes={"out": DRIVES[index]},
         reads={"commands": CMD_DRIVES[index]},
         start=index,
@@ -91,7 +93,7 @@ def _shaft(index: int) -> RoleSpec:
 
 
 def _by_shaft(name: str, of_shafts: tuple[Topic[Any], ...]) -> dict[str, Topic[Any]]:
-    """Parameters of a driver of several shafts: ``name``, ``name_2`` and so on."""
+    """Parameters of a driver for several shafts: ``name``, ``name_2`` and so on."""
     return {f"{name}_{i}" if i > 1 else name: topic for i, topic in enumerate(of_shafts, 1)}
 
 
@@ -107,7 +109,7 @@ DRIVE, DRIVE_2, DRIVE_3, DRIVE_4 = map(_shaft, range(len(SHAFTS)))
 WHEELS: Final = RoleSpec(
     name=DeviceRole.WHEELS.value,
     duty=Duty.ACTUATOR,
-    doc="One controller of all driven shafts, instead of one for each",
+    doc="One controller for all driven shafts, instead of one for each",
     writes=_by_shaft("out", DRIVES),
     reads=_by_shaft("commands", CMD_DRIVES),
     start=4,
@@ -116,7 +118,7 @@ WHEELS: Final = RoleSpec(
 ACTUATORS: Final = RoleSpec(
     name=DeviceRole.ACTUATORS.value,
     duty=Duty.ACTUATOR,
-    doc="One controller of all driven shafts that may steer and measure the battery as well, instead of one for each",
+    doc="One controller for all driven shafts, which may also steer and measure the battery, instead of one for each",
     writes={**_by_shaft("out", DRIVES), "steering": topics.STEERING, "battery": topics.BATTERY},
     reads={**_by_shaft("commands", CMD_DRIVES), "steering_commands": topics.CMD_STEERING, "drive": topics.DRIVE},
     start=4,
@@ -125,7 +127,7 @@ ACTUATORS: Final = RoleSpec(
 STEERING: Final = RoleSpec(
     name=DeviceRole.STEERING.value,
     duty=Duty.ACTUATOR,
-    doc="Servo controller of the axles, which may measure the battery as well",
+    doc="Servo controller of the axles, which may also measure the battery",
     writes={"out": topics.STEERING, "battery": topics.BATTERY},
     reads={"commands": topics.CMD_STEERING, "drive": topics.DRIVE},
     start=10,
@@ -142,7 +144,8 @@ STABILISER: Final = RoleSpec(
     name=DeviceRole.STABILISER.value,
     duty=Duty.SENSOR,
     doc=(
-        "Mount of the lidar; its own mount is the point both joints turn about, the lidar's is that with level joints"
+        "Mount of the lidar; its own mount is the point about which both joints turn, the lidar's is the "
+        "one with level joints"
     ),
     writes={"out": topics.STABILISER},
     reads={"commands": topics.PLAN_STABILISER},
@@ -184,14 +187,14 @@ ENCODERS: Final = RoleSpec(
 HAND: Final = RoleSpec(
     name=DeviceRole.HAND.value,
     duty=Duty.SENSOR,
-    doc="Receiver of the hand-held radio control; without it the robot does not move",
+    doc="Receiver of the hand-held radio control; if configured, the robot moves only while it is connected",
     writes={"out": topics.HAND},
     start=5,
 )
 BATTERY: Final = RoleSpec(
     name=DeviceRole.BATTERY.value,
     duty=Duty.MONITOR,
-    doc="Pack voltage by a converter of the kernel's Industrial-IO; instead of the servo controller's input",
+    doc="Pack voltage from a converter of the kernel's Industrial-IO, instead of the servo controller's input",
     writes={"out": topics.BATTERY},
     reads={"drive": topics.DRIVE},
 )
@@ -226,7 +229,7 @@ OUR_ROLES: Final = (
 
 
 class UsbIdentity(NamedTuple):
-    """How a device shows on USB; the emulated computer shows it so."""
+    """USB identity of a device, also used by the emulated computer."""
 
     usb_id: str
     """``vendor:product``."""
@@ -239,18 +242,19 @@ class UsbIdentity(NamedTuple):
 class DeviceKind(Plugin):
     """One kind of device; ``implementation`` is its driver.
 
-    A driver is a ``Service``, made with its settings, the opened port, the clock, and by name the ends of its role's
+    A driver is a ``Service``, created with its settings, the opened port, the clock, and by name the ends of its role's
     topics, ``events`` and ``name``.
     """
 
     roles: tuple[RoleSpec, ...]
-    """Roles it can take."""
+    """Roles it can fill."""
     emulator: str
     """Place ``module:function``: builds an ``Emulator``, or a ``FileEmulator`` for a monitor, from an
     ``EmulatorSetup``."""
     identity: str
-    """Place ``module:function``: awaits what ``identify`` opens, the clock and the driver's settings; returns facts for
-    JSON by name, without motion."""
+    """Place ``module:function``: a coroutine function that receives what ``identify`` opens, the clock and the driver's
+    settings; returns facts for JSON by name, without motion.
+    """
     also: Mapping[str, Topic[Any]] = field(default_factory=dict)
     """Topics written in addition to the role's topics, by the driver's parameter. The driver gets None if the topic is
     the main topic of another configured device."""
@@ -259,7 +263,7 @@ class DeviceKind(Plugin):
     baud: int | None = None
     """Baud rate of its serial line; None if the device is USB throughout and any rate works."""
     framing: Framing | None = None
-    """Bits of a byte on its serial line; None selects 8N1."""
+    """Bits per byte on its serial line; None: 8N1."""
     usb: UsbIdentity | None = None
     current: bool = False
     """Whether a motor controller measures the current of each motor."""
@@ -273,16 +277,16 @@ class DeviceKind(Plugin):
         """Run an emulated device until cancelled.
 
         Raises:
-            InputError: a mistake in its code.
+            InputError: an exception in its code.
         """
         with self.refusing(self.emulator):
             await emulator.run(end)
 
     def emulated(self, setup: EmulatorSetup) -> Any:
-        """Return an emulated device: an ``Emulator``, or a ``FileEmulator`` for a monitor; loads its module.
+        """Create an emulated device: an ``Emulator``, or a ``FileEmulator`` for a monitor; loads its module.
 
         Raises:
-            InputError: the factory does not load, or returns something else.
+            InputError: the factory does not load, or returns another object.
         """
         made, wanted = self.called(self.emulator, setup), FileEmulator if self.opens == "computer" else Emulator
         if not isinstance(made, wanted):
@@ -297,15 +301,16 @@ class DeviceKind(Plugin):
         Args:
             where: ``Port`` of a serial line or of an I2C bus, path of a video device, or the ``Computer``.
             clock: time.
-            settings: settings of the driver; None selects the defaults.
+            settings: settings of the driver; None: defaults.
 
         Returns:
-            JSON-able: the facts that the device reports; for a device on a port preceded by ``device`` and ``port``.
+            JSON-compatible: the facts reported by the device; for a device on a port preceded by ``device`` and
+            ``port``.
 
         Raises:
             DeviceLostError: not plugged in.
             DeviceTimeoutError: silence.
-            ProtocolError: an answer against the protocol.
+            ProtocolError: the device violates its protocol.
             WrongDeviceError: another device.
             PortBusyError: another process holds the port.
         """
@@ -328,7 +333,9 @@ class DeviceKind(Plugin):
             try:
                 json.dumps({name: value})
             except (TypeError, ValueError) as error:
-                raise InputError(f"{place}: {name}: expected a value for JSON, found {value!r}") from error
+                raise InputError(
+                    f"{place}: {name}: expected a value that JSON can represent, found {value!r}"
+                ) from error
         return found
 
 
@@ -340,14 +347,14 @@ besides its roles (a test compares)."""
 
 
 class DeviceCatalog(Catalog[DeviceKind]):
-    """All kinds of devices, and the roles they fill: ours, then those that kinds of other distributions bring."""
+    """All device kinds and roles: built-in ones, then those of other distributions."""
 
     def __init__(self, *rows: DeviceKind) -> None:
         super().__init__("monstertruck.devices", *rows)
         self._roles = {role.name: role for role in OUR_ROLES}
 
     def fault(self, row: Any) -> str | None:
-        """Return the fault of another distribution's kind or of a role it adds."""
+        """Error in a kind of another distribution, or in a role it adds."""
         if fault := super().fault(row):
             return fault
         if not row.roles:
@@ -364,13 +371,13 @@ class DeviceCatalog(Catalog[DeviceKind]):
 
     def _fault_of_role(self, row: DeviceKind, role: RoleSpec) -> str | None:
         if not re.fullmatch(r"[a-z][a-z0-9_]*", role.name) or not role.writes:
-            return f"role {role.name!r}: expected a name of small letters, digits and _ that writes a topic"
+            return f"role {role.name!r}: expected a name of lower-case letters, digits and _, and a topic to write"
         if hasattr(Schema, role.name) or role.name in RESERVED:
-            return f"role {role.name}: the name has another meaning"
+            return f"role {role.name}: the name is reserved"
         if role.duty is Duty.ACTUATOR and role not in OUR_ROLES:
-            return f"role {role.name}: actuators are this repository's alone"
+            return f"role {role.name}: only this repository may define actuators"
         if self._roles.get(role.name, role) != role:
-            return f"role {role.name}: another role has this name"
+            return f"role {role.name}: another role has the same name"
         if role.elements is not None and role.elements not in row.settings_class().model_fields:
             return f"role {role.name}: elements: {row.settings} has no field {role.elements}"
         written = (*role.writes.values(), *row.also.values())
@@ -391,10 +398,10 @@ class DeviceCatalog(Catalog[DeviceKind]):
         return tuple(kind for kind in self.values() if role in (known.name for known in kind.roles))
 
     def named(self, name: str) -> DeviceKind:
-        """A kind by its name, or the first one of a role.
+        """Return a kind by its name, or the first kind of a role.
 
         Raises:
-            InputError: there is none.
+            InputError: unknown name.
         """
         kinds = (self[name],) if name in self else self.of_role(name)
         if not kinds:
@@ -503,7 +510,7 @@ DEVICES: Final = DeviceCatalog(
     ),
     DeviceKind(
         name="maestro_esc",
-        doc="Radio-control speed controller on a Pololu Maestro that steers as well",
+        doc="Radio-control speed controller on a Pololu Maestro that also steers",
         roles=(ACTUATORS,),
         settings="monstertruck_drivers.maestro.esc_config:MaestroEscConfig",
         implementation="monstertruck_drivers.maestro.esc_driver:MaestroEscDriver",
@@ -523,7 +530,7 @@ DEVICES: Final = DeviceCatalog(
     ),
     DeviceKind(
         name="pca9685_esc",
-        doc="Radio-control speed controller on a PCA9685 that steers as well",
+        doc="Radio-control speed controller on a PCA9685 that also steers",
         roles=(ACTUATORS,),
         settings="monstertruck_drivers.pca9685.config:Pca9685EscConfig",
         implementation="monstertruck_drivers.pca9685.esc_driver:Pca9685EscDriver",
@@ -683,7 +690,7 @@ DEVICES: Final = DeviceCatalog(
 
 
 def start_order() -> tuple[str, ...]:
-    """Roles in their start order behind a returned hub."""
+    """Roles in their restart order after a hub returned."""
     roles = [role for role in DEVICES.roles.values() if role.duty is not Duty.MONITOR]
     return tuple(role.name for role in sorted(roles, key=lambda role: role.start))
 

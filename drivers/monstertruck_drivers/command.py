@@ -1,4 +1,4 @@
-"""A program whose output is the device: its bytes come over a link, and its end is the loss of the device."""
+"""A program that acts as a device: its output is read over a link, and its end is the loss of the device."""
 
 import asyncio
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from monstertruck_runtime.errors import DeviceLostError
 
 
 class CommandPort:
-    """Starts a program at every opening, without a shell, and ends it with the link.
+    """Starts a program, without a shell, each time the port is opened, and ends it with the link.
 
     Args:
         command: program and arguments.
@@ -39,7 +39,7 @@ class _ProgramOutput(asyncio.SubprocessProtocol):
     """Feeds a ``Link`` from a program.
 
     Args:
-        name: for error messages.
+        name: name for error messages.
     """
 
     def __init__(self, name: str) -> None:
@@ -52,7 +52,7 @@ class _ProgramOutput(asyncio.SubprocessProtocol):
         self.link = Link(self._name, lambda _: None, self._end, limit=STREAM_LIMIT)
 
     def pipe_data_received(self, fd: int, data: bytes | str) -> None:
-        """Output or error output."""
+        """Output or error output was received."""
         assert isinstance(data, bytes)
         if fd == 1:
             self.link.feed(data)
@@ -60,11 +60,11 @@ class _ProgramOutput(asyncio.SubprocessProtocol):
             self._said = (self._said + data)[-400:]  # bytes
 
     def process_exited(self) -> None:
-        """It ended by itself, or after SIGTERM."""
+        """The program ended by itself, or after SIGTERM."""
         said = self._said.decode(errors="backslashreplace").strip().rpartition("\n")[2]
         self.link.lose(f"ended with exit code {self._program.get_returncode()}{f': {said}' if said else ''}")
         self._program.close()
 
     def _end(self) -> None:
         self._program.terminate()
-        asyncio.get_running_loop().call_later(1.0, self._program.close)  # s to end after SIGTERM
+        asyncio.get_running_loop().call_later(1.0, self._program.close)  # seconds to end after SIGTERM

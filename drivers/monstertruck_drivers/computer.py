@@ -1,4 +1,4 @@
-"""The computer the daemon runs on, real or emulated: its USB tree, kernel files, programs and disk."""
+"""The computer that runs the daemon, real or emulated: its USB tree, kernel files, programs and disk."""
 
 import asyncio
 import logging
@@ -15,30 +15,30 @@ from monstertruck_runtime.threads import Offload, in_daemon_thread
 
 
 class Sysfs:
-    """Attributes below ``root``; what cannot be read is absent.
+    """Sysfs attributes below ``root``; unreadable ones are absent.
 
-    Some attributes wait for the device (strings, ``authorized``), so nothing of this belongs on the event loop.
+    Some attributes wait for the device (strings, ``authorized``), so they must not be read on the event loop.
     """
 
     def __init__(self, root: Path = Path("/sys")) -> None:
         self.root = root
 
     def text(self, path: str) -> str | None:
-        """Content of an attribute without surrounding blanks; None if it is not there or cannot be read."""
+        """Content of an attribute without surrounding blanks; None if it is missing or unreadable."""
         try:
             return (self.root / path).read_text(errors="backslashreplace").strip()
         except OSError:
             return None
 
     def number(self, path: str, base: int = 10) -> int | None:
-        """Content as an integer; None if it is none."""
+        """Content as an integer; None if it is not one."""
         try:
             return int(self.text(path) or "", base)
         except ValueError:
             return None
 
     def names(self, path: str) -> list[str]:
-        """Entries of a folder, sorted; none if it is not there."""
+        """Entries of a folder, sorted; empty if it is missing."""
         try:
             return sorted(entry.name for entry in (self.root / path).iterdir())
         except OSError:
@@ -48,7 +48,7 @@ class Sysfs:
         """Set an attribute.
 
         Raises:
-            OSError: it is not there, not permitted, or refused.
+            OSError: it is missing, not permitted, or rejected.
         """
         with (self.root / path).open("r+") as attribute:  # an attribute is never created
             attribute.write(text)
@@ -60,27 +60,27 @@ SUBSYSTEMS: Final = ("usb", "tty", "video4linux")
 
 
 class Watcher(Protocol):
-    """Source of hints; may miss some, so its user looks by itself now and then."""
+    """Source of change announcements; it may miss some, so its user also polls."""
 
     def start(self, hint: Callable[[], None]) -> None:
         """Call ``hint`` on the running loop whenever something may have changed, until ``stop``."""
 
     def stop(self) -> None:
-        """No more hints; may be called again."""
+        """Stop the announcements; may be called repeatedly."""
 
 
 class NoWatcher:
-    """For machines that announce nothing: the tree is only read now and then."""
+    """Source for machines without announcements: the tree is only polled."""
 
     def start(self, hint: Callable[[], None]) -> None:
-        """Nothing will come."""
+        """Do nothing."""
 
     def stop(self) -> None:
-        """Nothing came."""
+        """Do nothing."""
 
 
 class UdevWatcher:
-    """Listens to udev events after its rules ran, so links and permissions are in place.
+    """Listens to udev events after its rules ran, so links and permissions are up to date.
 
     Args:
         monitor: a ``pyudev.Monitor``, or an object with its interface.
@@ -92,14 +92,14 @@ class UdevWatcher:
         self._hint: Callable[[], None] = lambda: None
 
     def start(self, hint: Callable[[], None]) -> None:
-        """Listen on the running loop."""
+        """Start listening on the running loop."""
         self._hint = hint
         self._monitor.start()
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(self._monitor.fileno(), self._drain)
 
     def stop(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
         if self._loop is not None:
             self._loop.remove_reader(self._monitor.fileno())
             self._loop = None
@@ -110,14 +110,14 @@ class UdevWatcher:
                 pass
         except OSError as error:  # the kernel's queue overflowed: announcements are lost
             log.debug("udev: %s", error)
-            if self._loop is not None:  # uvloop calls the reader of a file with an error once, and then no more
+            if self._loop is not None:  # uvloop calls the reader of a file with an error once, then never again
                 self._loop.remove_reader(self._monitor.fileno())
                 self._loop.add_reader(self._monitor.fileno(), self._drain)
         self._hint()
 
 
 def open_watcher() -> Watcher:
-    """Udev's announcements where the machine has them, none otherwise."""
+    """Udev's announcements if the machine has udev, otherwise none."""
     try:
         # LGPL, for robots only, and it loads a system library.
         import pyudev  # noqa: PLC0415
@@ -126,7 +126,7 @@ def open_watcher() -> Watcher:
         for subsystem in SUBSYSTEMS:
             monitor.filter_by(subsystem)
     except (ImportError, OSError) as error:
-        log.warning("no udev announcements (%s): the USB tree is looked at every few seconds only", error)
+        log.warning("no udev announcements (%s): the USB tree is polled every few seconds instead", error)
         return NoWatcher()
     return UdevWatcher(monitor)
 
@@ -154,17 +154,18 @@ async def run_command(arguments: Sequence[str]) -> tuple[int, str]:
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """Files, nodes and programs; an emulated machine stands in for it in tests."""
+    """Files, nodes and programs; tests replace it by an emulated machine."""
 
     clock: Clock
     sysfs: Sysfs = field(default_factory=Sysfs)
     dev: Path = Path("/dev")
     offload: Offload = in_daemon_thread
-    """Runs reads and writes of its files. A hung device blocks its attributes, some for half a minute; neither other
-    look-ups nor the end of a driver may wait for them."""
+    """Runs reads and writes of its files in threads. A hung device blocks its attributes, some for half a minute; other
+    reads and the end of a driver must not wait for them.
+    """
     run: Callable[[Sequence[str]], Awaitable[tuple[int, str]]] = run_command
     serial: OpenSerial = SerialPort
-    """Makes the port of a serial node."""
+    """Creates the port of a serial node."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,16 +173,16 @@ class Disk:
     """A file system."""
 
     total: int
-    """Bytes."""
+    """Total size, bytes."""
     free: int
-    """Bytes that ordinary users may still take."""
+    """Free space for ordinary users, bytes."""
 
 
 def disk_of(path: Path) -> Disk:
     """The file system of ``path`` or of its nearest parent that exists.
 
     Raises:
-        DeviceError: it cannot be asked.
+        DeviceError: its size cannot be determined.
     """
     while not path.exists() and path != path.parent:
         path = path.parent
@@ -197,19 +198,19 @@ ROOT = Path("/")
 
 @dataclass(frozen=True, slots=True)
 class Computer:
-    """The computer the daemon runs on; an emulated one stands in for it in simulations."""
+    """The computer that runs the daemon; simulations replace it by an emulated one."""
 
     machine: Machine
     """Its USB tree."""
     root: Path = ROOT
     """Folder with its proc and sys."""
     watch: Callable[[], Watcher] = open_watcher
-    """Opens the source of USB announcements."""
+    """Creates the source of USB announcements."""
     disk: Callable[[Path], Disk] = disk_of
     """Its file system at a path."""
 
     @classmethod
     def at(cls, root: Path, clock: Clock) -> Self:
-        """The real computer, or the one another process emulates in the folder ``root``, which announces nothing."""
+        """The real computer, or one emulated by another process in the folder ``root``, which announces nothing."""
         machine = Machine(clock, Sysfs(root / "sys"), root / "dev")
         return cls(machine, root, open_watcher if root == ROOT else NoWatcher)

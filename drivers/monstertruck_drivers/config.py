@@ -1,6 +1,6 @@
-"""Which devices a robot has, their ports and their settings: the sections ``devices`` and ``monitors``.
+"""Devices of a robot, with their ports and settings: the sections ``devices`` and ``monitors``.
 
-Both have a key for every role of the catalog, and take the settings of every kind that fills the role.
+Both have a key for every role of the catalog, and accept the settings of every kind that fills the role.
 """
 
 import shlex
@@ -42,15 +42,15 @@ class PortConfig(Schema):
     """Port of a device."""
 
     path: Path
-    """Device node, best by hub port: /dev/truck/<role> or /dev/serial/by-path/..."""
+    """Device node, preferably by hub port: /dev/truck/<role> or /dev/serial/by-path/..."""
     baud: Baud | None = None
-    """Bits per second; null = the device's own. USB-CDC devices ignore it"""
+    """Baud rate; null: the device's default. USB-CDC devices ignore it"""
     dtr: bool = True
     """Level of the line DTR while the port is open; false lets an RPLIDAR's motor turn"""
     rts: bool = True
     """Level of the line RTS while the port is open"""
     framing: Framing | None = None
-    """Bits of a byte; null = the device's own"""
+    """Bits per byte; null: the device's default"""
 
     @property
     def label(self) -> str:
@@ -73,17 +73,17 @@ class TcpPortConfig(Schema):
 
     @property
     def is_local(self) -> bool:
-        """Whether the address is one of this computer's own, as an emulated device has."""
+        """Whether the address belongs to this computer, as for an emulated device."""
         return IPv4Address(self.address).is_loopback
 
     @property
     def label(self) -> str:
-        """Address and port."""
+        """Address and port as text."""
         return f"{self.address}:{self.tcp}"
 
 
 class CommandPortConfig(Schema):
-    """Program whose output is the device."""
+    """Program whose output replaces a device."""
 
     command: Annotated[tuple[str, ...], Field(min_length=1)]
     """Program and arguments, without a shell: [rpicam-vid, -t, "0", --codec, mjpeg, -o, "-"]"""
@@ -98,7 +98,7 @@ _WAYS: Final = {"hub": "port by hub", "address": "port by address", "command": "
 
 
 def _way(port: Any) -> str:
-    """Which of the ways to name a port ``port`` is; not a key of any, so that complaints find their line."""
+    """Which variant ``port`` is; not one of its keys, so that error messages find their line."""
     keys = port if isinstance(port, dict) else vars(port) if isinstance(port, Schema) else {}
     return next((way for key, way in _WAYS.items() if key in keys), "port by path")
 
@@ -129,25 +129,25 @@ class Device(Schema, Generic[C]):
     @model_validator(mode="after")
     def _own_baud(self) -> Self:
         own = {"baud": getattr(self.driver, "own_baud", self.kind.baud) or BAUD, "framing": self.kind.framing}
-        unset = {name for name, value in self.port if value is None}  # a network socket has neither
+        unset = {name for name, value in self.port if value is None}  # a network socket has no baud rate or DTR
         missing = {name: value for name, value in own.items() if value and name in unset}
         return self.model_copy(update={"port": self.port.model_copy(update=missing)}) if missing else self
 
 
 def kind_of(settings: Schema) -> DeviceKind:
-    """Kind of device that has such settings."""
+    """Kind of device with these settings."""
     return DEVICES[str(vars(settings)["kind"])]
 
 
 class _Devices(Schema):
-    """The robot's devices by role; a role that is left out is not there."""
+    """The robot's devices by role; an omitted role means no device."""
 
     def present(self) -> dict[str, Device[Any]]:
-        """The devices that are configured, by role."""
+        """Configured devices by role."""
         return dict(_present(self))
 
     def at_present(self, sysfs: Sysfs) -> Self:
-        """The same with the hubs of ports by the kernel's names of this moment."""
+        """The same devices, with the hubs of ports replaced by the kernel's current names."""
         moved = {
             role: device.model_copy(update={"port": device.port.at_present(sysfs)})
             for role, device in self.present().items()
@@ -165,7 +165,7 @@ class _Devices(Schema):
         return any(topic in topics for topics in written)
 
     def shafts(self) -> dict[str, Device[Any]]:
-        """The controllers of the driven shafts, by shaft; one may be there for several."""
+        """Controllers of the driven shafts, by shaft; one may control several."""
         return {SHAFTS[i]: device for role, device in self.present().items() for i in _served(role, device)}
 
     def controller(self) -> str | None:
@@ -185,7 +185,7 @@ class _Devices(Schema):
     def _one_steers(self) -> Self:
         roles = [role for role, _ in self._steering()]
         if len(roles) > 1:
-            raise ValueError(f"{roles[0]} and {roles[1]} both steer; one of them must leave its servos out")
+            raise ValueError(f"{roles[0]} and {roles[1]} both steer; remove the servos of one")
         return self
 
     @model_validator(mode="after")
@@ -195,7 +195,7 @@ class _Devices(Schema):
             port = device.port
             where = port.label
             if other := taken.get(where):
-                raise ValueError(f"{other} and {role} share the port {where}; every device needs its own")
+                raise ValueError(f"{other} and {role} have the same port {where}; expected a port for each")
             taken[where] = role
         return self
 
@@ -218,7 +218,9 @@ class _Devices(Schema):
     def _programs_give_pictures(self) -> Self:
         for role, device in self.present().items():
             if isinstance(device.port, CommandPortConfig) and device.kind.name != "mjpeg":
-                raise ValueError(f"{role}: only a camera of kind mjpeg is a program's output; expected another port")
+                raise ValueError(
+                    f"{role}: only a camera of kind mjpeg may read the output of a program; expected another port"
+                )
         return self
 
     @model_validator(mode="after")
@@ -235,7 +237,7 @@ class _Devices(Schema):
             writes = [topic.name for topic in DEVICES.roles[role].writes.values()]
             for topic in writes[: len(_served(role, device)) or 1]:
                 if other := owners.get(topic):
-                    raise ValueError(f"{other} and {role} both publish {topic}; a topic has one writer")
+                    raise ValueError(f"{other} and {role} both publish {topic}; expected one writer for each topic")
                 owners[topic] = role
         return self
 
@@ -249,7 +251,7 @@ class _Monitors(Schema):
     """Monitors of the computer itself, without a port; omitted monitors do not run."""
 
     def present(self) -> dict[str, Schema]:
-        """Settings of those that are configured, by role."""
+        """Settings of the configured monitors, by role."""
         return dict(_present(self))
 
 

@@ -1,4 +1,4 @@
-"""Emulated motor controllers that disobey: what such a controller makes of the targets it is commanded."""
+"""Disobedient emulated motor controllers: how they deviate from their commanded targets."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -6,20 +6,20 @@ from typing import Self
 
 
 class Disobedience(StrEnum):
-    """How a controller departs from its targets."""
+    """Kind of deviation from the targets."""
 
     IGNORE = "ignore"
-    """Slower and opposite targets are not taken: the motor keeps its speed."""
+    """Lower and opposite targets are ignored: the motor keeps its speed."""
     CREEP = "creep"
     """The motor never turns slower than a given speed."""
     RUN = "run"
     """The motor runs at a given speed, whatever is commanded."""
     REVERSE = "reverse"
-    """Targets are taken with the opposite sign."""
+    """Targets are applied with the opposite sign."""
 
 
 class StoppedBy(StrEnum):
-    """The first of the ways to stop a motor that still works; those after it work too."""
+    """The weakest way of stopping the motor that still works; the later ones work too."""
 
     STAGE = "stage"
     """Power stage off."""
@@ -35,12 +35,12 @@ USAGE = "ignore|reverse|creep RPM|run RPM [stage|line|supply], or off"
 
 @dataclass(frozen=True, slots=True)
 class DisobedientMotor:
-    """A controller's present disobedience.
+    """Current disobedience of a controller.
 
     Args:
         kind: how it disobeys.
         rpm: motor speed of CREEP and RUN, rpm, controller's own sign.
-        stopped_by: what still stops the motor.
+        stopped_by: weakest stop that still works.
     """
 
     kind: Disobedience
@@ -49,7 +49,7 @@ class DisobedientMotor:
 
     @classmethod
     def parse(cls, *words: str) -> Self | None:
-        """Read the words of a fault command; ``off`` is None.
+        """Parse the words of a fault command; ``off`` gives None.
 
         Raises:
             ValueError: expected ``USAGE``.
@@ -64,15 +64,15 @@ class DisobedientMotor:
         return cls(disobedience, rpm, StoppedBy(rest[0]) if rest else StoppedBy.STAGE)
 
     def target(self, asked: float | None, present: float, *, line: bool = False) -> float | None:
-        """Return the speed that the motor is driven to.
+        """Return the speed to which the motor is driven.
 
         Args:
-            asked: commanded speed, rpm; None = power stage off.
+            asked: commanded speed, rpm; None: power stage off.
             present: motor speed, rpm.
-            line: the hardware input asks for a quick stop.
+            line: whether the hardware input requests a quick stop.
 
         Returns:
-            Speed, rpm; None = power stage off.
+            Speed, rpm; None: power stage off.
         """
         if asked is None and self.stopped_by is StoppedBy.STAGE:
             return None

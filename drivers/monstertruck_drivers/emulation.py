@@ -1,4 +1,4 @@
-"""Emulator interface, the physics that emulators may query, and the parts an emulator is built from."""
+"""Emulator interface, the physics available to emulators, and the parts to build an emulator from."""
 
 import shutil
 from collections.abc import Callable, Iterable
@@ -22,7 +22,7 @@ class FileTree:
     """Files below a folder; each is replaced atomically, and only if its text changes.
 
     Args:
-        root: folder that stands for /, or for a part of it.
+        root: folder that replaces /, or a part of it.
     """
 
     def __init__(self, root: Path) -> None:
@@ -74,7 +74,7 @@ class Emulator(Protocol):
     name: str
 
     async def run(self, end: DeviceEnd) -> None:
-        """Serve until cancelled; survives hosts that come, go and die."""
+        """Serve until cancelled; survives hosts that connect, disconnect and die."""
 
     def power_cycle(self) -> None:
         """Switch the supply off and on: volatile state is lost, stored settings stay."""
@@ -83,7 +83,7 @@ class Emulator(Protocol):
         """Start (or end) a device fault by name.
 
         Raises:
-            InputError: unknown fault or bad value; the text lists what is known.
+            InputError: unknown fault or invalid value; the text lists the known ones.
         """
 
 
@@ -104,7 +104,7 @@ class FileEmulator(Protocol):
         """Start or end a fault.
 
         Raises:
-            InputError: unknown fault or bad value.
+            InputError: unknown fault or invalid value.
         """
 
 
@@ -112,7 +112,7 @@ class RangeSource(Protocol):
     """Source of a lidar's scans."""
 
     def scan(self, time_ns: int) -> NDArray[np.int32]:
-        """Raw distances in mm of one revolution that began at ``time_ns``.
+        """Raw distances of one revolution that started at ``time_ns``, mm.
 
         Shape (769,), step 0..768; values below 20 are the sensor's error codes.
         """
@@ -151,11 +151,11 @@ class BeamSource(Protocol):
     """Source of beam ranges for a scanner of any geometry."""
 
     def beams(self, bearings: Array, times_ns: NDArray[np.int64], sheet: RangeSheet) -> Array:
-        """Ranges of single beams, shape (n,), m: +inf = nothing within range, NaN = the measurement failed.
+        """Ranges of single beams, shape (n,), m: +inf: nothing within range, NaN: the measurement failed.
 
         Args:
             bearings: counter-clockwise from the scanner's x axis, shape (n,), rad.
-            times_ns: instants of the beams, shape (n,), rising, over at most half a second.
+            times_ns: times of the beams, shape (n,), increasing, over at most half a second.
             sheet: reach and noise.
         """
 
@@ -165,7 +165,7 @@ class ScannedRoom(RangeSource, BeamSource, Protocol):
 
 
 class MotorReading(NamedTuple):
-    """State of a motor shaft at one instant, with the controller's sign."""
+    """State of a motor shaft at one time, with the controller's sign."""
 
     turns: float
     """Shaft revolutions since power-up of the world."""
@@ -237,7 +237,7 @@ class ImuReading(NamedTuple):
     """True input of an inertial measurement unit, in its axes: x forward, y left, z up."""
 
     angular_velocity: tuple[float, float, float]
-    """rad/s."""
+    """Angular velocity, rad/s."""
     acceleration: tuple[float, float, float]
     """Specific force, m/s^2: at rest and level, z is +9.81."""
     temperature_c: float
@@ -268,28 +268,28 @@ class SonarSource(Protocol):
         """
 
     def range(self, name: str) -> float:
-        """Distance measured by a sonar's latest ping (m), available once its echo is back; inf = no echo."""
+        """Distance measured by a sonar's latest ping (m), available once its echo is back; inf: no echo."""
 
 
 class JointSource(Protocol):
     """Joints of a mount: a pitch joint on the body, a roll joint on the pitch joint, the device on the roll joint."""
 
     def angles(self, times_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """True pitch and roll, rad, REP 103, at rising instants of the last second; each (n,)."""
+        """True pitch and roll, rad, REP 103, at increasing times within the last second; each (n,)."""
 
 
 class ViewSource(Protocol):
     """Source of a camera's pictures."""
 
     def exposure(self, time_ns: int, size: tuple[int, int], /) -> Callable[[], NDArray[np.uint8]]:
-        """Return a function that draws the picture of an instant, in any thread, one at a time.
+        """Return a function that draws the image of a time; callable in any thread, one call at a time.
 
         Args:
-            time_ns: instant of the exposure.
+            time_ns: time of the exposure.
             size: width and height, pixels.
 
         Returns:
-            Makes (height, width, 3): red, green, blue; the top row first.
+            Function that returns an image (height, width, 3): red, green, blue; the top row first.
         """
 
 
@@ -297,9 +297,9 @@ class Horn(NamedTuple):
     """Assembly of a servo in the lidar's mount."""
 
     zero: float | None
-    """Position at which the lidar is parallel to the body (steps); None = value from the driver's settings."""
+    """Position at which the lidar is parallel to the body (steps); None: value from the driver's settings."""
     direction: Literal[-1, 1] | None
-    """+1 where a rising position turns the joint positively; None = value from the driver's settings."""
+    """+1 if a rising position turns the joint in the positive direction; None: value from the driver's settings."""
 
 
 class Physics(Protocol):
@@ -360,7 +360,7 @@ class EmulatorSetup:
 
     role: str
     settings: Any
-    """Settings of the driver; None = defaults."""
+    """Settings of the driver; None: defaults."""
     clock: Clock
     physics: Physics
     seed: int = 0

@@ -1,4 +1,4 @@
-"""Motor behind a speed controller that gives no feedback: the rate to ask for, and the rate it may have."""
+"""Motor behind a speed controller without feedback: the rate to command, and the estimated actual rate."""
 
 import math
 from typing import Final
@@ -17,7 +17,7 @@ MODES: Final = {
 
 
 class UnmeasuredMotor:
-    """Follows ``cmd/drive`` and reports the commanded rate, slowed as configured.
+    """Follows ``cmd/drive`` and reports the commanded rate, delayed as configured.
 
     Args:
         esc: speed controller.
@@ -41,7 +41,7 @@ class UnmeasuredMotor:
         self._out = out
         self._timeout = round(command_timeout * SECOND)
         self._ready_at = 0
-        """When the speed controller has had its neutral pulses, ns."""
+        """Time when the speed controller has received its neutral pulses, ns."""
         self._rate = self._turned = 0.0
         """Estimated rate, rad/s, and angle, rad, at ``_at``."""
         self._at = 0
@@ -55,7 +55,7 @@ class UnmeasuredMotor:
         return self._esc.pulse_us(self._wanted(self._clock.now()))
 
     def _wanted(self, now: int) -> float:
-        """Rate to ask for, rad/s."""
+        """Rate to command, rad/s."""
         command = self._commands.latest
         if command is None or self._mode(now) is not DriveMode.ENABLED or now < self._ready_at:
             return 0.0
@@ -71,7 +71,7 @@ class UnmeasuredMotor:
         return DriveMode.QUICK_STOP if stale else MODES[command.action]
 
     def publish(self, stamp: int, received: int) -> None:
-        """Publish the rate that the motor may have; nothing while the speed controller has its neutral pulses."""
+        """Publish the estimated rate of the motor; nothing while the speed controller receives its neutral pulses."""
         if stamp < self._ready_at:
             return
         wanted = self._wanted(stamp)

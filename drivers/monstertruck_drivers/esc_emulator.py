@@ -1,4 +1,4 @@
-"""Emulated speed controller (ESC) that pulses control.
+"""Emulated speed controller (ESC) with a pulse input.
 
 A real one reads a pulse every 20 ms, does not move before it has received neutral pulses for a while, lets the motor
 coast without pulses, and gives no feedback of the motor.
@@ -16,10 +16,10 @@ class EscEmulator:
     """Speed controller with its motor.
 
     Args:
-        esc: its pulses.
+        esc: settings of its pulses.
         clock: time.
         plant: the motor.
-        pulse: pulse at its input at an instant, ns (us); None without pulses.
+        pulse: pulse width at its input at a time (ns), us; None without pulses.
     """
 
     def __init__(self, esc: EscPulses, clock: Clock, plant: MotorPlant, pulse: Callable[[int], float | None]) -> None:
@@ -31,7 +31,7 @@ class EscEmulator:
         self._armed = False
 
     async def run(self) -> None:
-        """Obey the pulses until cancelled."""
+        """Follow the pulses until cancelled."""
         while True:
             await self._clock.sleep(0.02)  # seconds between two pulses
             now = self._clock.now()

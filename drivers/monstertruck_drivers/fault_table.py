@@ -1,4 +1,4 @@
-"""Faults of an emulated device: one table of what can be made to go wrong with it."""
+"""Table of the faults of an emulated device."""
 
 from collections.abc import Callable, Mapping
 
@@ -12,8 +12,8 @@ class FaultTable:
     """Faults of one device.
 
     The value of a row starts the fault: a function, which receives the values as text, and ``on|off`` as a bool; or a
-    number, which the table keeps and the device looks up. A ``False`` is switched on and off, an ``int`` is the number
-    of times that the fault will strike, a ``float`` is a quantity.
+    number, which the table keeps and the device reads. A ``False`` is a switch, an ``int`` is the number of remaining
+    occurrences, a ``float`` is a quantity.
 
     Args:
         device: name of the device, for messages.
@@ -56,7 +56,7 @@ class FaultTable:
         self._numbers[fault] = number
 
     def strikes(self, fault: str) -> bool:
-        """Return whether a counted fault strikes now, and count it."""
+        """Return whether a counted fault occurs now, and count it."""
         left = self._numbers[fault]
         self._numbers[fault] = max(left - 1, 0)
         return left > 0
@@ -83,7 +83,7 @@ class FaultTable:
 
 
 class LateAnswers:
-    """Fault ``late SECONDS [COUNT]``: the next answers come later than usual."""
+    """Fault ``late SECONDS [COUNT]``: the next answers are delayed."""
 
     def __init__(self) -> None:
         self._delays: list[float] = []
@@ -98,7 +98,7 @@ class LateAnswers:
 
 
 class FaultyDevice:
-    """Base of the emulators: its faults are those of its table."""
+    """Base of the emulators, with the faults of its table."""
 
     faults: FaultTable
 
@@ -116,7 +116,7 @@ def _on(word: str) -> bool:
 
 
 def _number(before: float, usage: list[str], values: tuple[str, ...]) -> float:
-    """Return the number that the values set; without a value, a switch goes on and a counted fault strikes once."""
+    """Parse the number from the values; without a value, a switch is turned on and a counted fault occurs once."""
     optional = all(word.startswith("[") for word in usage)
     (word,) = ("on" if isinstance(before, bool) else "1",) if optional and not values else values
     if len(values) > len(usage):

@@ -170,7 +170,7 @@ class Link:
             RuntimeError: a task waits already.
         """
         if self._waiting is not None:
-            raise RuntimeError(f"{self.name}: two readers")
+            raise RuntimeError(f"{self.name}: a second reader: a link has only one")
         self._waiting, self._due = waiting, due
         if due is not None and (self._alarm is None or self._rings > due):
             self._set_alarm(asyncio.get_running_loop(), due)

@@ -29,7 +29,7 @@ class ServoPulses(Schema):
     @model_validator(mode="after")
     def _centre_within_limits(self) -> Self:
         if not self.min_us < self.centre_us < self.max_us:
-            raise ValueError(f"min_us {self.min_us} < centre_us {self.centre_us} < max_us {self.max_us} does not hold")
+            raise ValueError(f"expected min_us {self.min_us} < centre_us {self.centre_us} < max_us {self.max_us}")
         return self
 
     def pulse_us(self, angle: float) -> float:

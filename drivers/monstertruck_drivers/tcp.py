@@ -75,7 +75,9 @@ class _TcpProtocol(asyncio.Protocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         """The connection is gone."""
-        self.link.lose(f"connection lost ({_why(exc)})" if isinstance(exc, OSError) else "the device hung up")
+        self.link.lose(
+            f"connection lost ({_why(exc)})" if isinstance(exc, OSError) else "the device closed the connection"
+        )
 
 
 def _why(error: OSError) -> str:

@@ -172,7 +172,7 @@ class _PortNode:
                 outcome.result().close()
             raise
         if outcome.cancel():
-            raise DeviceWedgedError(f"{name}: does not open: its device does not answer the kernel")
+            raise DeviceWedgedError(f"{name}: does not open: the device does not answer the kernel")
         return outcome.result()
 
     def begin(self) -> Future[None]:
@@ -190,8 +190,8 @@ class _PortNode:
             if not work.done():
                 self._overdue = work
                 raise DeviceWedgedError(
-                    f"{name}: the kernel has not let go of it since its last use: its device takes no bytes or does "
-                    "not answer; switch it off and on, or replug it"
+                    f"{name}: the kernel has not released it since its last use, because the device "
+                    "accepts no bytes or does not answer; switch it off and on, or replug it"
                 )
             self._work = [work for work in self._work if not work.done()]
 
@@ -394,7 +394,7 @@ class _SerialProtocol(asyncio.Protocol):
 
     def _give_up(self) -> None:
         """Drop the outdated bytes of a device that takes none."""
-        self.link.lose(f"its device has taken no bytes for {MAX_AGE:g} s", DeviceWedgedError)
+        self.link.lose(f"its device has accepted no bytes for {MAX_AGE:g} s", DeviceWedgedError)
         self._hang_up()
 
     def _hang_up(self) -> None:

@@ -15,8 +15,9 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.readable import when_readable
 
 CABLE = (
-    "of its cable: plug, unplug, power-cycle, line stalled|deaf on|off, line delay SECONDS, line chunk BYTES|off, "
-    "line flip_rate|drop_rate|lose_rate|double_rate PROBABILITY, line garbage HEX, line short_writes COUNT"
+    "Cable faults: plug, unplug, power-cycle, line stalled|deaf on|off, line delay SECONDS, line chunk "
+    "BYTES|off, line flip_rate|drop_rate|lose_rate|double_rate PROBABILITY, line garbage HEX, line "
+    "short_writes COUNT"
 )
 
 
@@ -142,7 +143,9 @@ class CommandedGroup:
             next(iter(self.members.values())).command(words)
         else:
             first = next(iter(self.members), "")
-            raise InputError(f"name a {self.kind} first: {', '.join(self.members)}; `{first} help` lists its commands")
+            raise InputError(
+                f"start the line with a {self.kind}: {', '.join(self.members)}; `{first} help` lists its commands"
+            )
 
 
 class FaultConsole:

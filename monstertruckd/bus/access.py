@@ -60,8 +60,8 @@ class Sender:
 
     def refusal(self, needed: AccessRole) -> str:
         """Why its role does not include ``needed``."""
-        hint = "; the key names no source" if self.source == ANONYMOUS else ""
-        return f"{self.source} has the role {self.grant.role}, this takes {needed}{hint}"
+        hint = "; the key contains no source" if self.source == ANONYMOUS else ""
+        return f"{self.source} has the role {self.grant.role}, but this needs {needed}{hint}"
 
 
 def role_needed(request: Request) -> AccessRole:

@@ -71,9 +71,9 @@ class CallLimits:
             with self._lock:
                 owner = owner_of(source)
                 if self._estops[owner] >= ESTOPS.owner:
-                    return f"{ESTOPS.owner} emergency stops of {owner} are being carried out"
+                    return f"{ESTOPS.owner} emergency stops of {owner} are still in progress"
                 if self._estops.total() >= ESTOPS.together:
-                    return f"{ESTOPS.together} emergency stops are being carried out"
+                    return f"{ESTOPS.together} emergency stops are still in progress"
                 self._estops[owner] += 1
             return ""
         rates, what = (self._orders, "orders") if name in ORDERS else (self._calls, "calls")

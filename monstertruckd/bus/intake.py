@@ -247,7 +247,7 @@ class Intake:
         """
         name, limit, source = self._name, self._limit, sender.source
         if size > limit.size:
-            text = f"{name}: request of {size} bytes, at most {limit.size} are taken"
+            text = f"{name}: request of {size} bytes, at most {limit.size} are accepted"
             self._refusals.add(Reason.BAD_INPUT, source, text)
             return
         if not self.charge(source):
@@ -260,7 +260,7 @@ class Intake:
         # 512: commas, and brackets, braces and quotes, of one request: many small objects would take tens of
         # milliseconds
         if data.count(b",") > 16_384 or sum(map(data.count, (b"[", b"{", b'"'))) > 512:  # commas of a request at most
-            self._refusals.add(Reason.BAD_INPUT, source, f"{name}: request of too many parts")
+            self._refusals.add(Reason.BAD_INPUT, source, f"{name}: request in too many parts")
             return
         try:
             request = wire.decode(self.topic, data)
@@ -335,7 +335,7 @@ class StandIntake:
         """Judge, decode and queue one pose; callable from any thread. Arguments as of ``Intake.take``."""
         name = STAND_POSE.name
         if size > self.SIZE:
-            self._refusals.add(Reason.BAD_INPUT, name, f"{name}: {size} bytes, at most {self.SIZE} are taken")
+            self._refusals.add(Reason.BAD_INPUT, name, f"{name}: {size} bytes, at most {self.SIZE} are accepted")
         elif not self._rates.spend(name):
             self._refusals.add(Reason.MESSAGES_DROPPED, name, f"{name}: more than {self.RATE:g} poses a second")
         else:

@@ -103,7 +103,7 @@ class Bus:
                 (commands: ``actuators``; events: ``event_sink``; requests: ``inject``).
         """
         if topic.group == "cmd" or topic.inward or topic.name == EVENT.name:
-            msg = f"{topic.name} has no plain write end"
+            msg = f"{topic.name} cannot be written directly: open the writer of its role"
             raise RuntimeError(msg)
         if writer is not topic.writer:
             msg = f"{topic.name} is written by {topic.writer}, not by {writer}"
@@ -251,7 +251,7 @@ class Bus:
 
     def _claim(self, topic: Topic[M]) -> LocalPublisher[M]:
         if topic.name in self._claimed:
-            msg = f"the write end of {topic.name} is already handed out"
+            msg = f"{topic.name} already has a writer"
             raise RuntimeError(msg)
         self._claimed.add(topic.name)
         return LocalPublisher(self, topic)
@@ -279,7 +279,7 @@ class Bus:
 
 def _require_own(topic: Topic[Any]) -> None:
     if topic.writer is Writer.STAND:
-        msg = f"{topic.name} is recorded, and read by nothing in the robot"
+        msg = f"{topic.name} is only recorded: no part of the robot may read it"
         raise RuntimeError(msg)
 
 

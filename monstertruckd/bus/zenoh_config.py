@@ -51,7 +51,7 @@ class TlsConfig(Schema):
         names = (*self.pilots, *self.observers, *self.engineers)
         everybody = (*names, *self.routers)
         if not self.pilots and not self.engineers:
-            raise ValueError("tls: expected a name in pilots or engineers: nobody could drive")
+            raise ValueError("tls: expected a name in pilots or engineers: no station could drive")
         if twice := sorted({name for name in everybody if everybody.count(name) > 1}):
             raise ValueError(f"tls: {', '.join(twice)}: expected one role each")
         if unknown := sorted(set(self.ranks) - set(names)):
@@ -99,7 +99,7 @@ class ZenohConfig(Schema):
     def _endpoints(cls, given: tuple[str, ...]) -> tuple[str, ...]:
         for endpoint in given:
             if not is_endpoint(endpoint):
-                raise ValueError(f"{endpoint!r} is no endpoint: expected tcp/HOST:PORT or tls/HOST:PORT")
+                raise ValueError(f"{endpoint!r} is not an endpoint: expected tcp/HOST:PORT or tls/HOST:PORT")
         return given
 
     @property
@@ -116,8 +116,9 @@ class ZenohConfig(Schema):
     def _guarded(self) -> Self:
         if self.open_endpoints and not self.insecure:
             raise ValueError(
-                f"zenoh: {', '.join(self.open_endpoints)}: anybody on the network could drive the robot; "
-                "expected tls/... endpoints with zenoh.tls (monstertruckd security init), or zenoh.insecure: true"
+                f"zenoh: {', '.join(self.open_endpoints)}: anyone on the network could drive the robot; "
+                "expected tls/... endpoints with zenoh.tls (monstertruckd security init), or "
+                "zenoh.insecure: true"
             )
         if self.certified_endpoints and self.tls is None:
             raise ValueError(f"zenoh: {', '.join(self.certified_endpoints)} needs zenoh.tls")

@@ -202,9 +202,7 @@ class ZenohBridge:
             text = _SOURCE_PLACE.sub("", str(error))
             if "in use" in text or "EAGAIN" in text:
                 holder = holder_of(listener.listen)
-                raise BusyError(
-                    f"{where} is in use by {holder}; a second robot needs zenoh.listen of its own"
-                ) from error
+                raise BusyError(f"{where} is in use by {holder}; give a second robot another zenoh.listen") from error
             msg = f"zenoh cannot open {where}: {text}"
             raise ConfigError(msg) from error
         except OSError as error:
@@ -335,7 +333,7 @@ class ZenohBridge:
         size = 0 if query.payload is None else len(query.payload)
         name, source = self._called(query)
         if size > MAX_CALL:
-            text = f"payload of {size} bytes, at most {MAX_CALL} are taken"
+            text = f"payload of {size} bytes, at most {MAX_CALL} are accepted"
             replies.end(query, _error(failure(Reason.BAD_INPUT, text)), source)
         elif text := limits.refusal(name, source, queries.waiting):
             replies.end(query, _error(failure(Reason.BUSY, text)), source)

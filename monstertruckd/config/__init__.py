@@ -1,1 +1,1 @@
-"""Configuration: YAML with line numbers in, one resolved and typed tree out."""
+"""Configuration: reads YAML with line numbers and resolves it to one typed tree."""

@@ -1,8 +1,8 @@
-"""Calibration of a truck: measured values with their uncertainty, the folder that keeps them, and how they apply.
+"""Calibration of a truck: measured values with their uncertainty, the folder of their files, and their application.
 
 Files are numbered and dated, ``0003-2026-11-21T160102Z.json``; the latest is used. A file is written under another
-name, synced and then renamed, so that after any crash the latest one is whole. No file is ever changed or removed:
-undoing writes a newer file with the older value.
+name, synced and then renamed, so after any crash the latest one is complete. No file is ever changed or removed: undo
+writes a newer file with the older value.
 """
 
 import fcntl
@@ -29,7 +29,7 @@ from monstertruckd.config.wizards import WIZARDS
 C = TypeVar("C", bound=TruckConfig)
 
 CONFIDENCE: Final = 0.95
-"""Confidence of every interval: the share of trucks measured like this whose true value is inside."""
+"""Confidence level of every interval: the share of trucks measured in this way whose true value is inside."""
 
 
 Value = bool | int | float
@@ -51,10 +51,10 @@ WizardName = Annotated[str, AfterValidator(_known)]
 
 
 def _date(text: str) -> str:
-    """A date as ``utc`` writes it, or nothing.
+    """Accept a date in the format of ``utc``, or an empty text.
 
     Raises:
-        ValueError: something else.
+        ValueError: the text has another format.
     """
     if text:
         np.datetime64(text.removesuffix("Z"), "s")
@@ -74,19 +74,21 @@ class Estimate(Schema):
     """Lower end of the interval; None: the value is a choice (a sign), not a number"""
     high: float | None = None
     samples: Annotated[int, Field(ge=1)]
-    """Measurements it rests on"""
+    """Number of measurements"""
     meaning: str
     """Meaning of the value, and coverage of its interval"""
     key: Annotated[str, AfterValidator(present_key)] | None = None
-    """Place in the configuration that it sets, of whatever version; None: for information only"""
+    """Key of the configuration that the value sets, of any version; None: for information only"""
     date: str = ""
-    """When it was measured, UTC by the robot's clock; set when it is saved"""
+    """Time of measurement, UTC by the robot's clock; set when it is saved"""
     grade: Grade | None = None
     """Grade by the width of its interval; None without an interval or a goal"""
     valid_until: "ValidUntil | None" = None
     """Set when it is saved; None: of an older release"""
     file: Annotated[int, Field(ge=0)] = 0
-    """Number of the file that first held it, because clocks may be wrong; 0: not saved yet, or by an older release"""
+    """Number of the first file that contains it, because clocks may be wrong; 0: not saved yet, or by an older
+    release
+    """
 
 
 class ValidUntil(Schema):
@@ -97,9 +99,9 @@ class ValidUntil(Schema):
     odometer: float | None = None
     """Total distance driven, m; None: not limited by distance"""
     part: str = ""
-    """Device that was measured, and its port; another device, or one that was plugged elsewhere, is another part"""
+    """Measured device and its port; another device or another port ends the validity"""
     serial: str = ""
-    """Its serial number by USB; empty: it was not known"""
+    """USB serial number of the device; empty: unknown"""
 
 
 class Result(Schema):
@@ -116,11 +118,11 @@ class Result(Schema):
     unobserved: tuple[str, ...] = ()
     """Quantities that this measurement cannot determine"""
     readings: tuple[tuple[float, ...], ...] = ()
-    """Raw readings that a later run may use again; the wizard defines their meaning"""
+    """Raw readings that a later run may reuse; the wizard defines their meaning"""
     partial: bool = False
-    """Only these were measured: other results of the run before stay"""
+    """Whether only these estimates were measured, so that other estimates of the previous run are kept"""
     again: str | None = None
-    """Steps that remain before the calibration is complete"""
+    """Remaining steps until the calibration is complete"""
 
     def over(self, before: "Result | None", date: str, file: int = 0) -> "Result":
         """Return this result as saved on ``date`` in file ``number``, with estimates kept from ``before``."""
@@ -131,7 +133,7 @@ class Result(Schema):
         return self.model_copy(update={"date": date, "estimates": fresh + kept})
 
     def estimate(self, name: str) -> Estimate | None:
-        """The estimate of that name."""
+        """Return the estimate with this name."""
         return next((estimate for estimate in self.estimates if estimate.name == name), None)
 
     def number(self, name: str) -> float:
@@ -142,11 +144,11 @@ class Result(Schema):
 
 
 class CalibrationFile(Schema):
-    """Everything known of one truck; replaced as a whole, never changed."""
+    """All calibration results of one truck; replaced as a whole, never modified."""
 
     version: Literal[1] = 1
     number: Annotated[int, Field(ge=1)]
-    """Counts the files of this truck"""
+    """Number of the file"""
     robot: str
     written: str
     """UTC, by the robot's clock"""
@@ -156,7 +158,7 @@ class CalibrationFile(Schema):
 
 
 def utc(real_ns: int) -> str:
-    """A real (UNIX) time, ns, as ``YYYY-MM-DDThh:mm:ssZ``."""
+    """Format a real (UNIX) time, ns, as ``YYYY-MM-DDThh:mm:ssZ``."""
     return f"{np.datetime64(real_ns // SECOND, 's')}Z"
 
 
@@ -164,10 +166,10 @@ _FILE_NAME: Final = re.compile(r"(\d{4,})-[0-9TZ-]+\.json")
 
 
 class CalibrationStore:
-    """Reads and writes the files of one truck; every method may block for a file system's time.
+    """Reads and writes the files of one truck; every method may block for file access.
 
     Args:
-        folder: made when the first file is written.
+        folder: folder of the files, created when the first file is written.
         robot: name of the truck.
     """
 
@@ -195,20 +197,20 @@ class CalibrationStore:
         return next(reversed(self.files()), None)
 
     def load(self, path: Path) -> CalibrationFile:
-        """Read one file.
+        """Load one file.
 
         Raises:
-            ConfigError: it is damaged, too long, or of another truck; names the file and what to do.
+            ConfigError: the file is damaged, too large, or of another truck; the message names the file and the remedy.
         """
         try:
-            require_file(path, 1_000_000)  # size of one file at most
+            require_file(path, 1_000_000)  # maximum file size
             file = CalibrationFile.model_validate_json(path.read_bytes())
         except Exception as error:
             what = error.strerror if isinstance(error, OSError) else cause_of(error)
-            msg = f"{path}: no usable calibration: {what}; move it away to go back to the one before"
+            msg = f"{path}: no usable calibration: {what}; move it away to return to the previous one"
             raise UnusableFileError(path, msg) from error
         if file.robot != self._robot:
-            raise ConfigError(f"{path}: robot: is the calibration of {file.robot!r}, this is {self._robot!r}")
+            raise ConfigError(f"{path}: robot: calibration of {file.robot!r}, expected {self._robot!r}")
         return file
 
     def current(self) -> CalibrationFile | None:
@@ -221,14 +223,14 @@ class CalibrationStore:
         return None if path is None else self.load(path)
 
     def save(self, result: Result, real_ns: int) -> Path:
-        """Write a new file with ``result`` in place of the wizard's last one; return its path.
+        """Write a new file with ``result`` in place of the wizard's previous result; return its path.
 
         Args:
             result: measured estimates.
             real_ns: real time now.
 
         Raises:
-            ConfigError: the latest file is damaged, or the new one cannot be written; nothing has changed then.
+            ConfigError: the latest file is damaged, or the new one cannot be written; nothing is changed.
         """
         with self._alone():
             current = self.current()
@@ -237,28 +239,28 @@ class CalibrationStore:
             return self._write({result.wizard: saved}, f"{result.wizard} calibrated", real_ns)
 
     def undo(self, wizard: WizardName, real_ns: int) -> Path:
-        """Write a new file with the wizard's result as it was before its last change; returns its path.
+        """Write a new file with the wizard's previous result; return its path.
 
-        Undoing twice is doing it again.
+        A second undo redoes the change.
 
         Raises:
-            NotFoundError: this wizard has never changed anything.
+            NotFoundError: this wizard has no result.
             ConfigError: see ``save``.
         """
         with self._alone():
             history = [self.load(path).results.get(wizard) for path in reversed(self.files())]
             if all(result is None for result in history):
-                raise NotFoundError(f"{self.folder}: {wizard} was never calibrated, there is nothing to undo")
+                raise NotFoundError(f"{self.folder}: {wizard} was never calibrated: no result to undo")
             before = next((result for result in history if result != history[0]), None)
             change = f"{wizard} as it was " + ("before any calibration" if before is None else f"on {before.date}")
             return self._write({wizard: before}, change, real_ns)
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
-        """Keep other writers out, in this process and in others, from reading the latest file to writing the next one.
+        """Lock out other writers, in this process and others, between reading the latest file and writing the next one.
 
         Raises:
-            ConfigError: the folder cannot be made or opened.
+            ConfigError: the folder cannot be created or opened.
         """
         with self._writing:
             try:
@@ -297,15 +299,15 @@ def _number(path: Path) -> int:
 
 
 def with_values(config: C, results: Iterable[Result], source: Path | str) -> C:
-    """``config`` with the values of ``results``; values of devices that this truck has not are left out.
+    """Return ``config`` with the values of ``results``; values of missing devices are ignored.
 
     Args:
-        config: as configured, or calibrated before.
+        config: configuration, calibrated or not.
         results: results of the wizards.
-        source: named in complaints.
+        source: name used in error messages.
 
     Raises:
-        ConfigError: a value that no wizard may set, or one that the configuration refuses.
+        ConfigError: a wizard may not set a value, or the configuration rejects it.
     """
     data = config.model_dump()
     put_values(data, results, source)
@@ -316,17 +318,17 @@ def with_values(config: C, results: Iterable[Result], source: Path | str) -> C:
 
 
 def put_values(data: dict[str, Any], results: Iterable[Result], source: Path | str) -> None:
-    """Put the values of ``results`` into a configuration's plain data, which is not validated.
+    """Put the values of ``results`` into the plain data of a configuration, without validation.
 
     Raises:
-        ConfigError: a value that no wizard may set.
+        ConfigError: a wizard may not set a value.
     """
     for result, _, estimate in in_order(results):
         _set(data, estimate, result, source)
 
 
 def in_order(results: Iterable[Result]) -> list[tuple[Result, int, Estimate]]:
-    """Estimates that set a value, each with its result and its index there, latest last.
+    """Estimates that set a value, each with its result and its index in the result, latest last.
 
     A partial measurement keeps old estimates, which may be older than another wizard's. If both set a value, the newer
     estimate is used.
@@ -336,7 +338,7 @@ def in_order(results: Iterable[Result]) -> list[tuple[Result, int, Estimate]]:
 
 
 def unused(config: TruckConfig, results: Iterable[Result]) -> list[str]:
-    """Keys of calibrated values that ``config`` has no place for: their device is not there, or has another name."""
+    """Keys of calibrated values without a place in ``config``: the device is missing or renamed."""
     data = config.model_dump()
     keys = [estimate.key for _, _, estimate in in_order(results) if estimate.key is not None]
     return [key for key in dict.fromkeys(keys) if _section(data, key) is None]
@@ -351,7 +353,7 @@ def _set(data: dict[str, Any], estimate: Estimate, result: Result, source: Path 
 
 
 def _section(data: dict[str, Any], key: str) -> dict[str, Any] | None:
-    """The mapping that holds the value at ``key``; None where the configuration has none there."""
+    """Return the mapping that contains ``key``; None if the configuration has no such section."""
     section = data
     for part in key.split(".")[:-1]:
         inner = section.get(part)
@@ -368,7 +370,7 @@ def may_set(wizard: WizardName, key: str) -> bool:
 
 
 def value_at(config: Mapping[str, Any], key: str) -> Value | None:
-    """A value of a resolved configuration; None where there is no such section."""
+    """Return a value of a resolved configuration; None without its section."""
     section: Any = config
     for part in key.split("."):
         if not isinstance(section, Mapping):

@@ -1,4 +1,4 @@
-"""Calibration calls of the daemon: it alone writes the calibration, if its user may, and reports the file in use."""
+"""Calibration calls of the daemon, the only writer of the calibration."""
 
 import json
 from collections.abc import Callable
@@ -42,13 +42,13 @@ def register(
 
     Args:
         rpc: registry of remote calls.
-        config: the running one, calibration included.
-        loaded: the file it includes.
-        clock: dates the files.
-        events: gets an event for every new file.
-        offload: where files are read and written.
-        mode: the gate's current mode; nothing is written while the truck may move.
-        watch: gives a result its grades and expiry, and knows the proposal.
+        config: running configuration, including the calibration.
+        loaded: calibration file in use.
+        clock: clock for the dates of files.
+        events: sink of events, one for every new file.
+        offload: runs reads and writes of files.
+        mode: returns the gate's current mode; files are written only while the truck is disarmed.
+        watch: adds grades and expiry to results, and holds the proposal.
     """
     store = CalibrationStore(config.calibration_folder, config.robot)
 
@@ -56,14 +56,18 @@ def register(
         return clock.now() + clock.real_offset()
 
     def announced(path: Path, what: str, by: Any) -> dict[str, Any]:
-        events(Reason.OK, Severity.INFO, "calibration", f"{path}: {what}; counts from the next start", by=str(by))
+        events(
+            Reason.OK,
+            Severity.INFO,
+            "calibration",
+            f"{path}: {what}; the daemon applies it at its next start",
+            by=str(by),
+        )
         return {"file": str(path)}
 
     def at_rest() -> None:
         if mode().active:
-            raise RequestRefusedError(
-                Reason.BUSY, f"the robot is {mode()}: calibrations are written while it is disarmed"
-            )
+            raise RequestRefusedError(Reason.BUSY, f"the robot is {mode()}: disarm it before saving a calibration")
 
     async def show(_: dict[str, Any]) -> dict[str, Any]:
         def read() -> dict[str, Any]:
@@ -108,10 +112,10 @@ def register(
 
 
 def _result(payload: Any) -> Result:
-    """A result from outside.
+    """Parse a result received from a client.
 
     Raises:
-        InputError: it is none.
+        InputError: it is invalid.
     """
     try:
         return Result.model_validate_json(json.dumps(payload))

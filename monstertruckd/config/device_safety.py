@@ -1,6 +1,6 @@
-"""Safety-relevant settings of devices: values beyond the body's limits, and values less safe than the default.
+"""Safety-relevant device settings: values beyond the body's limits, and values less safe than the default.
 
-As in ``monstertruckd.gate.config`` for the gate's own.
+Counterpart of ``monstertruckd.gate.config`` for devices.
 """
 
 import math
@@ -57,7 +57,7 @@ WEAKER_ABOVE: Final[dict[type[Schema], tuple[str, ...]]] = {
         "plausible_max",
     ),
 }
-"""Settings that are weaker the greater they are."""
+"""Settings that are weaker when increased."""
 
 WEAKER_BELOW: Final[dict[type[Schema], tuple[str, ...]]] = {
     EposConfig: (
@@ -77,7 +77,7 @@ WEAKER_BELOW: Final[dict[type[Schema], tuple[str, ...]]] = {
     Os4000Config: (),
     PackConfig: ("low", "clear", "clear_after", "critical", "collapsed"),
 }
-"""Settings that are weaker the less they are."""
+"""Settings that are weaker when decreased."""
 
 UNATTENDED: Final[dict[type[Schema], tuple[str, ...]]] = {
     EposConfig: ("command_timeout", "quick_stop_after", "status_period"),
@@ -89,17 +89,17 @@ UNATTENDED: Final[dict[type[Schema], tuple[str, ...]]] = {
     Pca9685Config: ("command_timeout",),
     Pca9685EscConfig: ("command_timeout",),
 }
-"""Times during which the truck drives on, whatever happens."""
+"""Times during which the truck continues unattended."""
 
 BY_CELLS: Final = (
     *("low", "clear", "critical", "collapsed", "overcharged", "overcharged_clear"),
     *("max_compensation", "plausible_max"),
 )
-"""Voltages of a pack, which are compared cell by cell."""
+"""Pack voltages, compared per cell."""
 
 
 def unattended_times(devices: Devices) -> Iterator[tuple[str, float]]:
-    """Times of drivers during which the truck drives on, whatever happens (s), by name."""
+    """Times of drivers during which the truck continues unattended (s), by name."""
     for role, device in devices.present().items():
         driver = device.driver
         for name in UNATTENDED.get(type(driver), ()):
@@ -131,20 +131,20 @@ def weakened_devices(devices: Devices, monitors: Monitors) -> Iterator[str]:
 
     Args:
         devices: devices of the robot.
-        monitors: likewise.
+        monitors: monitors of the robot.
     """
     for role, device in devices.present().items():
         driver, place = device.driver, f"devices.{role}.driver"
         if type(driver) in WEAKER_ABOVE:
             yield from _weaker(place, driver, type(driver)())
         if isinstance(driver, StepperConfig):
-            yield f"{place}: steppers report the steps commanded: a wheel that is held or slips is not noticed"
+            yield f"{place}: steppers report the commanded steps: a blocked or slipping wheel is not noticed"
         if isinstance(driver, Pca9685Config | Pca9685EscConfig):
             yield f"{place}: a PCA9685 has no watchdog: it repeats the latest pulses while the computer hangs"
         if isinstance(driver, MaestroEscConfig | Pca9685EscConfig):
-            yield f"{place}: nothing measures the motor: a wheel that is held, slips or rolls on is not noticed"
+            yield f"{place}: no sensor measures the motor: a blocked, slipping or coasting wheel is not noticed"
         if isinstance(driver, ArduinoBridgeConfig):
-            yield f"{place}: its lines have no sum: a damaged command runs the motors until the next one"
+            yield f"{place}: its protocol has no checksum: a damaged command runs the motors until the next command"
         if isinstance(driver, MaestroConfig):
             if driver.deadman_feed == "always":
                 yield f"{place}.deadman_feed always: the deadman line guards against a dead process only"
@@ -160,14 +160,14 @@ def _weaker(place: str, config: Schema, usual: Schema) -> Iterator[str]:
 
 
 def _usual_pack(pack: PackConfig) -> PackConfig:
-    """The default thresholds for as many cells."""
+    """Default thresholds for the same number of cells."""
     usual = PackConfig()
     share = pack.cells / usual.cells
     return usual.model_copy(update={name: round(getattr(usual, name) * share, 6) for name in BY_CELLS})
 
 
 def packs(devices: Devices, monitors: Monitors) -> Iterator[tuple[str, PackConfig]]:
-    """Whatever measures the battery, with its place in the configuration."""
+    """Devices that measure the battery, with their place in the configuration."""
     if isinstance(monitors.battery, PackConfig):
         yield "monitors.battery", monitors.battery
     for role, device in devices.present().items():
@@ -182,8 +182,7 @@ def _beyond_cells(place: str, pack: PackConfig) -> Iterator[str]:
         volts = getattr(pack, name)
         if volts < empty * pack.cells:
             yield f"{place}.{name} {volts:g} V: at least {empty * pack.cells:g}, where {pack.cells} cells are empty"
-    # 4.5: volts of one that no charger reaches
-    # 0.5: volts of a cell, the most that a motor's current may explain
+    # 4.5: cell voltage that no charger reaches, V 0.5: maximum drop of a cell's voltage by motor current, V
     for name, most in (("plausible_max", 4.5), ("max_compensation", 0.5)):
         volts = getattr(pack, name)
         if volts > most * pack.cells:

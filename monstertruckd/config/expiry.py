@@ -42,14 +42,14 @@ from monstertruckd.config.truck import TruckConfig
 from monstertruckd.config.wizards import WIZARDS
 
 DAY: Final = 86_400 * SECOND
-"""ns."""
+"""Period between two messages, ns."""
 
 
 _UNKNOWN: Final[Mapping[str, str]] = MappingProxyType({})
 
 
 def grade(wizard: WizardName, estimate: Estimate) -> Grade | None:
-    """A: the interval is as narrow as meant; B: at most twice as wide; C: wider. None: it has no goal."""
+    """Grade of an interval: A: as narrow as intended; B: at most twice as wide; C: wider; None: no goal."""
     goals = WIZARDS[wizard].goals
     goal = goals.get(estimate.name, goals.get(f"*_{estimate.name.rpartition('_')[2]}"))
     if goal is None or estimate.low is None or estimate.high is None:
@@ -61,7 +61,7 @@ def grade(wizard: WizardName, estimate: Estimate) -> Grade | None:
 
 
 def part_of(config: TruckConfig, role: str) -> str:
-    """Device of a role and its port; empty where there is none."""
+    """Device of a role and its port; empty if there is none."""
     device = config.devices.present().get(role)
     if device is None:
         return ""
@@ -71,14 +71,14 @@ def part_of(config: TruckConfig, role: str) -> str:
 
 
 def serials_of(tree: UsbTree) -> dict[str, str]:
-    """Serial numbers of the devices that hang by hub and port, by role."""
+    """Serial numbers of the devices configured by hub and port, by role."""
     return {node.role: node.serial for node in tree.nodes if node.role is not None and node.serial is not None}
 
 
 def stamped(
     result: Result, config: TruckConfig, real_ns: int, odometer: float, serials: Mapping[str, str] = _UNKNOWN
 ) -> Result:
-    """A result with grades and validity of its estimates, as it is saved now; ``serials`` as far as they are known."""
+    """Return a result with grades and validity of its estimates, as saved now; ``serials`` where known."""
     life = WIZARDS[result.wizard].lifetime
     until = ValidUntil(
         date=utc(real_ns + life.days * DAY),
@@ -101,7 +101,7 @@ def worst(result: Result) -> Grade:
 def state_of(
     result: Result, config: TruckConfig, real_ns: int, odometer: float, serials: Mapping[str, str] = _UNKNOWN
 ) -> CalibrationState:
-    """Grade and validity of a result now; ``serials`` as far as they are known."""
+    """Grade and validity of a result now; ``serials`` where known."""
     ends = [e.valid_until for e in result.estimates if e.valid_until is not None]
     life = WIZARDS[result.wizard].lifetime
     until = min((end.date for end in ends), default=_later(result.date, life.days))
@@ -117,9 +117,9 @@ def state_of(
     elif other is not None:
         expired = f"{life.role} was the device with serial number {other}, it is {serial}"
     elif now > until:
-        expired = f"measured {result.date[:10]}, counted until {until[:10]}"
+        expired = f"measured {result.date[:10]}, valid until {until[:10]}"
     elif left is not None and left < 0.0:
-        expired = f"{-left / 1000:.1f} km farther than it counts"
+        expired = f"distance driven exceeds its validity by {-left / 1000:.1f} km"
     return CalibrationState(
         wizard=result.wizard, grade=worst(result), date=result.date, until=until, metres_left=left, expired=expired
     )
@@ -131,10 +131,10 @@ def _later(date: str, days: int) -> str:
 
 @dataclass
 class DistanceCounter:
-    """Total distance driven, m, kept over restarts.
+    """Total distance driven, m, kept across restarts.
 
     Args:
-        file: where; None: nowhere.
+        file: file of the distance; None: not saved.
     """
 
     file: Path | None
@@ -142,7 +142,7 @@ class DistanceCounter:
     written: float = 0.0
 
     def load(self) -> str:
-        """Read it; the distance starts at 0 if the file is missing, unreadable or damaged.
+        """Read the file; the distance starts at 0 if it is missing, unreadable or damaged.
 
         Returns:
             Fault of the file; empty if it is intact or missing.
@@ -161,10 +161,10 @@ class DistanceCounter:
         return wrong and f"{self.file}: {wrong}"
 
     def save(self) -> None:
-        """Write it, whole or not at all.
+        """Write the file atomically.
 
         Raises:
-            OSError: it cannot be written.
+            OSError: the file cannot be written.
         """
         if self.file is None:
             return
@@ -174,17 +174,17 @@ class DistanceCounter:
 
 
 class CalibrationWatch:
-    """Counts the distance driven, publishes the state of every calibration, and marks values of expired ones.
+    """Counts the distance driven, publishes the state of every calibration, and marks values based on expired ones.
 
     Args:
-        config: the running one.
+        config: running configuration.
         results: results of the calibration in use.
         bus: bus whose messages are marked.
         clock: time.
-        events: gets an event when one ends.
-        offload: where files are written.
+        events: sink of events, one for each expiry.
+        offload: runs writes of files.
         odometer: total distance driven.
-        proposal: proposals of trackers, or None.
+        proposal: store of the trackers' proposal; None without one.
     """
 
     name = ServiceName.CALIBRATION.value
@@ -223,17 +223,17 @@ class CalibrationWatch:
         proposal = self.proposal
         if proposal is not None and (wrong := await self._offload(proposal.load)):
             where = await self._offload(proposal.put_aside)
-            text = f"{wrong}: a proposed calibration is lost and has to be learnt again; {where}"
+            text = f"{wrong}: the proposed calibration is lost and must be learnt again; {where}"
             self._events(Reason.FILE_DAMAGED, Severity.WARNING, self.name, text)
 
     async def consider(self, state: TrackerState) -> None:
-        """Propose a tracker's estimate of the steering, if it is new."""
+        """Propose a tracker's estimate of the steering if it is new."""
         proposal = self.proposal
         if proposal is None or not proposal.consider(state, utc(self._real())):
             return
         self._look()
         if proposal.result is not None:
-            text = f"{proposal.result.measured}; `calibrate accept` keeps it"
+            text = f"{proposal.result.measured}; `calibrate accept` saves it"
             self._events(Reason.OK, Severity.INFO, self.name, text)
         await self._keep_proposal(proposal)
 
@@ -248,7 +248,7 @@ class CalibrationWatch:
         try:
             await self._offload(proposal.save)
         except OSError as error:
-            text = f"{proposal.file}: the proposed calibration is not saved: {error.strerror}"
+            text = f"{proposal.file}: the proposed calibration cannot be saved: {error.strerror}"
             self._events(disk_reason(error), Severity.WARNING, self.name, text)
 
     def stamped(self, result: Result) -> Result:
@@ -274,7 +274,8 @@ class CalibrationWatch:
         ):
             before: float | None = None
             try:
-                # Seconds between two checks of the drive's position: half of it at most is missing of every reversal.
+                # Seconds between two checks of the drive's position: at a reversal at most half of the travel in this
+                # time is missed.
                 drive_check_period = 1.0
                 for count in itertools.count(1):
                     await self._clock.sleep(drive_check_period)
@@ -296,13 +297,13 @@ class CalibrationWatch:
 
     async def _keep(self) -> None:
         odometer = self.odometer
-        # 1.0: metres: less is not written, to spare the memory card
+        # 1.0: minimum distance that is written, m, to spare the memory card
         if odometer.file is None or abs(odometer.metres - odometer.written) < 1.0:
             return
         try:
             await self._offload(odometer.save)
         except OSError as error:
-            text = f"{odometer.file}: the distance driven is not saved: {error.strerror}"
+            text = f"{odometer.file}: the distance driven cannot be saved: {error.strerror}"
             self._events(disk_reason(error), Severity.WARNING, self.name, text)
 
     def _look(self) -> None:

@@ -1,7 +1,7 @@
-"""Settings that may be changed while the robot runs, and the remote calls for them: ``settings`` and ``set``.
+"""Settings that can be changed while the robot runs, and their remote calls ``settings`` and ``set``.
 
-A setting is live if its model marks it (``monstertruck_schemas.base.LIVE``). Whatever is changed, the whole
-configuration is validated as at the start, so that nothing passes the ceilings of the body.
+A setting is live if its model marks it (``monstertruck_schemas.base.LIVE``). After every change the whole configuration
+is validated as at the start, so that no value exceeds the limits of the body.
 """
 
 import asyncio
@@ -29,16 +29,18 @@ SET: Final = "set"
 
 
 def with_settings(config: T, values: Mapping[str, Any]) -> T:
-    """``config`` with other values of live settings, validated as a whole.
+    """Return ``config`` with other values of live settings, validated as a whole.
 
     Raises:
-        InputError: a setting is unknown or not live, or a value is refused; names the possible values.
+        InputError: a setting is unknown or not live, or a value is invalid; the message lists the possible values.
     """
     known = {setting.key for setting in live_settings(config)}
     data = config.model_dump()
     for key in values:
         if key not in known:
-            raise InputError(f"{key}: cannot be changed while the robot runs; there are {', '.join(sorted(known))}")
+            raise InputError(
+                f"{key}: cannot be changed while the robot runs; expected one of {', '.join(sorted(known))}"
+            )
     put_settings(data, values)
     try:
         return type(config).model_validate(data)
@@ -50,10 +52,10 @@ class LiveConfig:
     """The running configuration, with replaceable live settings.
 
     Args:
-        config: at the daemon's start.
-        apply: gives every part its settings, between two ticks of the gate.
-        events: gets an event for every change, with who made it.
-        offload: where configurations are validated and files written.
+        config: configuration at the daemon's start.
+        apply: applies the settings to every part, between two ticks of the gate.
+        events: sink of events, one for every change, with its author.
+        offload: runs validation and writes of files.
     """
 
     def __init__(
@@ -67,7 +69,7 @@ class LiveConfig:
         self._saved = SavedSettings(config.state_directory, config.robot)
         self._start = config
         self._kept: dict[str, LiveValue] = {}
-        """Saved in this run."""
+        """Settings saved in this run."""
         self._turn = asyncio.Lock()
 
     def register(self, rpc: Rpc) -> None:
@@ -99,7 +101,7 @@ class LiveConfig:
         return {"values": values, "file": str(self._saved.path) if save else None, "weakened": weaker}
 
     def _keep(self, values: dict[str, LiveValue]) -> None:
-        """Save settings, unless the next start would refuse them without those that are not saved."""
+        """Save settings, unless the next start would reject them without the unsaved ones."""
         kept = self._kept | values
         with_settings(self._start, kept)
         self._saved.save(values)
@@ -107,12 +109,12 @@ class LiveConfig:
 
 
 def _values(given: Any) -> dict[str, LiveValue]:
-    """Parse settings from a request.
+    """Parse the settings in a request.
 
     Raises:
-        InputError: there are none, or too many; the models check the values.
+        InputError: the request contains no settings or too many; the models check the values.
     """
-    most = 32  # settings changed by one call
+    most = 32  # maximum number of settings changed by one call
     if not isinstance(given, dict) or not 0 < len(given) <= most:
         raise InputError(f"values: expected 1 to {most} settings by their dotted names")
     for key, value in given.items():

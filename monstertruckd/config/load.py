@@ -1,7 +1,7 @@
 """Loads a robot's configuration: YAML merged along ``include:``, validated, with saved settings and calibration on top.
 
-Every value remembers its file and line; every error is one line with file, line, key and expectation.
-YAML is read as version 1.2: ``true`` and ``false`` are the only booleans, ``1e-3`` is a number, ``0o17`` is octal.
+Every value keeps its file and line; every error is one line with file, line, key and expected value. YAML is read as
+version 1.2: ``true`` and ``false`` are the only booleans, ``1e-3`` is a number, ``0o17`` is octal.
 """
 
 import difflib
@@ -47,7 +47,7 @@ HEAD: Final = (
     "Settings changed while the robot ran (monstertruckd set --save); they replace those of the configuration."
 )
 YAML_1_1 = ("yes", "no", "on", "off")
-"""Booleans of YAML 1.1 in lower case: text since 1.2."""
+"""Lower-case booleans of YAML 1.1: text since 1.2."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,21 +63,21 @@ class Origin:
 
 @dataclass(slots=True)
 class Tree:
-    """Merged data and the origin of every key in it."""
+    """Merged data, and the origin of every key."""
 
     data: dict[str, Any]
     origins: dict[Key, Origin] = field(default_factory=dict)
     files: list[Path] = field(default_factory=list)
-    """The file itself, then every file it depends on by relative names; resolved."""
+    """The file itself, then all files referenced by relative names; resolved."""
     maps: list[Path] = field(default_factory=list)
-    """Folders and YAML files of maps that it refers to by relative names."""
+    """Folders and YAML files of maps referenced by relative names."""
     calibration: Path | None = None
     """Calibration file whose values replace the configuration's, if any."""
     unused: list[str] = field(default_factory=list)
-    """Keys in it without a place in the configuration."""
+    """Keys of the calibration file without a place in the configuration."""
 
     def origin(self, key: Key) -> Origin | None:
-        """Origin of ``key``, or of its nearest parent that has one."""
+        """Origin of ``key``, or of its closest parent with an origin."""
         for length in range(len(key), -1, -1):
             if key[:length] in self.origins:
                 return self.origins[key[:length]]
@@ -85,10 +85,10 @@ class Tree:
 
 
 def load_truck(path: Path) -> tuple[TruckConfig, Tree]:
-    """The configuration at ``path`` with the saved settings and the calibration of its robot.
+    """Load the configuration at ``path`` with the saved settings and the calibration of its robot.
 
     Raises:
-        ConfigError: one line per mistake, in the file, in the saved settings or in the calibration.
+        ConfigError: one line per error in the file, the saved settings or the calibration.
     """
     return calibrated(*load_config(path, TruckConfig))
 
@@ -97,16 +97,16 @@ def load_config(path: Path, model: type[S]) -> tuple[S, Tree]:
     """Read, merge and validate ``path``, without calibration.
 
     Returns:
-        The frozen configuration, and the tree with every value's origin.
+        The frozen configuration, and the tree with the origin of every value.
 
     Raises:
-        ConfigError: one line per mistake, each naming file, line, key and expectation.
+        ConfigError: one line per error, with file, line, key and expected value.
     """
     return validated(load_tree(path), path, model)
 
 
 def resolved(config: Schema) -> dict[str, Any]:
-    """The whole configuration as plain data, defaults included."""
+    """Return the whole configuration as plain data, including defaults."""
     dumped: dict[str, Any] = TypeAdapter(type(config)).dump_python(config, mode="json")
     return dumped
 
@@ -115,18 +115,18 @@ def resolved(config: Schema) -> dict[str, Any]:
 
 
 def calibrated(config: T, tree: Tree, without: Collection[Path] = ()) -> tuple[T, Tree]:
-    """The configuration with saved live settings and the latest calibration, and the tree.
+    """Return the configuration with saved live settings and the latest calibration, and the tree.
 
-    The tree has each value's origin. Both are validated together, as when they were saved: a calibrated value may bound
-    a setting.
+    The tree contains each value's origin. Settings and calibration are validated together, as when they were saved,
+    because a calibrated value may bound a setting.
 
     Args:
-        config: without either.
-        tree: its values.
-        without: files of either that are left out.
+        config: configuration without settings and calibration.
+        tree: tree of ``config``.
+        without: files of settings or calibration to ignore.
 
     Raises:
-        UnusableFileError: one of their files is damaged, or the configuration refuses a value of it.
+        UnusableFileError: one of their files is damaged, or the configuration rejects a value.
         ConfigError: the calibration is of another truck, or its folder cannot be read.
     """
     saved = SavedSettings(config.state_directory, config.robot)
@@ -161,7 +161,7 @@ def calibrated(config: T, tree: Tree, without: Collection[Path] = ()) -> tuple[T
 
 
 def _is_valid(config: TruckConfig, results: Collection[Result], path: Path) -> bool:
-    """Whether the configuration takes a calibration without saved settings."""
+    """Whether the configuration accepts a calibration without saved settings."""
     data = config.model_dump()
     put_values(data, results, path)
     try:
@@ -180,13 +180,13 @@ def _calibrated_origins(results: Mapping[WizardName, Result], lines: Mapping[Key
 
 
 class SavedSettings:
-    """The file of live settings that outlast the run; its methods may block for a file system's time.
+    """File of live settings kept across restarts; its methods may block for file access.
 
     Keys of any version are read under their current names; the next save writes these.
 
     Args:
-        folder: the robot's ``state_directory``; the file in it is made when the first setting is saved.
-        robot: its name.
+        folder: the robot's ``state_directory``; the file is created when the first setting is saved.
+        robot: name of the robot.
     """
 
     def __init__(self, folder: Path, robot: str) -> None:
@@ -196,7 +196,7 @@ class SavedSettings:
         """Saved values by dotted key, each with its line; empty without a file.
 
         Raises:
-            UnusableFileError: the file is damaged; names the line.
+            UnusableFileError: the file is damaged; the message names the line.
         """
         origins = dict[Key, Origin]()
         try:
@@ -216,7 +216,7 @@ class SavedSettings:
         """Merge saved values into a configuration's data before validation.
 
         Raises:
-            UnusableFileError: one is not a live setting of the configuration; names the line.
+            UnusableFileError: a value is not a live setting of the configuration; the message names the line.
         """
         known = {setting.key for setting in live_settings(config)}
         for key, (_, line) in values.items():
@@ -226,10 +226,10 @@ class SavedSettings:
         put_settings(data, {key: value for key, (value, _) in values.items()})
 
     def save(self, values: Mapping[str, LiveValue]) -> None:
-        """Add or replace settings; the rest of the file stays, comments too.
+        """Add or replace settings; the rest of the file, including comments, is kept.
 
         Raises:
-            ConfigError: the file is damaged, or cannot be written; nothing has changed then.
+            ConfigError: the file is damaged or cannot be written; nothing is changed.
         """
         content = _with_comments(self._text().text) if self.values() else None
         if content is None:
@@ -286,8 +286,8 @@ def load_tree(path: Path) -> Tree:
     """Read ``path`` and everything it includes; later values win over included ones, mappings merge.
 
     ``include`` is a file name or a list of them, relative to the including file. Keys of older versions are read under
-    their current names; the files stay as they are. In texts ``{robot}`` stands for the robot's name, so that robots
-    that share a file have separate ports and folders.
+    their current names; files are not modified. ``{robot}`` in texts stands for the robot's name, so that robots that
+    share a file have separate ports and folders.
 
     Raises:
         ConfigError: a file is missing, is not YAML, repeats a key or includes itself.
@@ -300,7 +300,7 @@ def load_tree(path: Path) -> Tree:
 
 
 def _named(value: Any, robot: str) -> Any:
-    """The value with the placeholder replaced by the robot's name."""
+    """Replace the placeholder by the robot's name."""
     match value:
         case str():
             return value.replace(PLACEHOLDER, robot)
@@ -323,9 +323,9 @@ def _load(path: Path, including: tuple[Path, ...], inherited: int | None) -> Tre
 
 
 def included(path: Path, name: str) -> Path:
-    """Path of the file ``name`` named in the file ``path``: relative to its folder, with links resolved.
+    """Path of the file ``name`` in the file ``path``: relative to its folder, with links resolved.
 
-    Without ``..`` in it, where that means the same: not behind a link to a folder.
+    Contains no ``..`` unless it follows a link to a folder.
     """
     joined = path.parent / name
     short = Path(os.path.normpath(joined))
@@ -354,7 +354,7 @@ def _with_includes(own: Tree, path: Path, including: tuple[Path, ...], version: 
 
 
 def _merge(base: Tree, top: Tree) -> None:
-    """Merge ``top`` over ``base``, values and origins."""
+    """Merge ``top`` over ``base``: values and origins."""
     replaced: set[Key] = set()
     _merge_values(base.data, top.data, (), replaced)
     kept = (
@@ -383,25 +383,25 @@ def _other_kind(below: dict[str, Any], above: dict[str, Any]) -> bool:
 
 @dataclass(slots=True)
 class _Builder:
-    """Builds the values of one file, with their origins."""
+    """Builds the values of one file with their origins."""
 
     path: Path
     origins: dict[Key, Origin]
     scalar: Callable[[Node], Any] = field(default_factory=lambda: reader().constructor.construct_object)
     """Constructs the value of a scalar node."""
     around: list[Node] = field(default_factory=list)
-    """Nodes that contain the current one."""
+    """Nodes that contain the current node."""
     count: int = 0
-    """Values built."""
+    """Number of values built."""
 
 
 def _build(node: Node, builder: _Builder, key: Key) -> Any:
     where = Origin(builder.path, node.start_mark.line + 1)
     builder.origins.setdefault(key, where)
     builder.count += 1
-    most_values = 20_000  # values of one file at most; a full configuration has a few hundred
+    most_values = 20_000  # maximum number of values in one file; a full configuration has a few hundred
     if builder.count > most_values:
-        raise ConfigError(f"{where}: more than {most_values} values, those that aliases repeat included")
+        raise ConfigError(f"{where}: more than {most_values} values, including those repeated by aliases")
     if node in builder.around:
         raise ConfigError(f"{where}: an alias in its own anchor: the value would contain itself")
     if isinstance(node, ScalarNode):
@@ -437,9 +437,9 @@ def _build_mapping(node: Node, builder: _Builder, key: Key) -> dict[str, Any]:
 
 
 def reader() -> YAML:
-    """Reads one document of plain data; ``_build`` bounds the expansion of aliases, and names them."""
-    # 5_000: keys and values in the text of one file, at most: read in a quarter of a second; a full configuration has
-    # some hundreds
+    """Reads one document of plain data; ``_build`` bounds the expansion of aliases."""
+    # 5_000: maximum number of keys and values in one file, read in a quarter of a second; a full configuration has a
+    # few hundred
     return bounded_yaml(5_000, expand=False)
 
 
@@ -474,7 +474,7 @@ def _check_directives(text: str, path: Path) -> None:
         if words and not line.startswith(("%", "#")):
             return
         if words[:1] == ["%YAML"] and words[1:2] != ["1.2"]:
-            raise ConfigError(f"{path}:{number}: {line.strip()}: expected YAML 1.2; leave this line out")
+            raise ConfigError(f"{path}:{number}: {line.strip()}: expected YAML 1.2; remove this line")
 
 
 def _meant(path: Path) -> Path | None:
@@ -550,7 +550,7 @@ class YamlText:
         return bool(places)
 
     def _pairs(self, key: tuple[str, ...]) -> list[tuple[Node, Node]]:
-        """Name and value of all that fits ``key``."""
+        """Name and value of all entries that match ``key``."""
         nodes: list[Node | None] = [self.root]
         pairs: list[tuple[Node, Node]] = []
         for part in key:
@@ -573,7 +573,7 @@ def _end(node: Node) -> int:
 
 
 Step = Callable[[YamlText], None]
-"""Edits one file from its version to the next; must be idempotent."""
+"""Function that edits one file from its version to the next; must be idempotent."""
 
 
 def _rename_keys(names: Mapping[str, str], text: YamlText) -> None:
@@ -589,27 +589,27 @@ OLDEST: Final = min(STEPS)
 
 
 def run_steps(text: YamlText, version: int, steps: Mapping[int, Step], target: int) -> None:
-    """Bring a text from ``version`` to ``target``.
+    """Migrate a text from ``version`` to ``target``.
 
     Raises:
-        ConfigError: there is no step from a version between them.
+        ConfigError: a version between them has no migration step.
     """
     for number in range(version, target):
         if number not in steps:
-            raise ConfigError(f"{text.path}: no way from version {number} to {number + 1}")
+            raise ConfigError(f"{text.path}: cannot be migrated from version {number} to {number + 1}")
         steps[number](text)
         text.replace(("version",), str(number + 1))
 
 
 def bring_up_to_date(text: YamlText, inherited: int | None) -> int | None:
-    """Rename the keys of an older version's file to the current ones, in memory only.
+    """Rename the keys of an older version to the current ones, in memory only.
 
     Args:
         text: content of the file.
         inherited: version of the file that includes it.
 
     Returns:
-        The version it had; None if that is missing or not known, and nothing was done.
+        Version before the renaming; None if it is missing or unknown, and no key was renamed.
     """
     said = text.value("version")
     version = inherited if text.node("version") is None else int(said) if said and said.isdecimal() else None
@@ -623,7 +623,7 @@ def bring_up_to_date(text: YamlText, inherited: int | None) -> int | None:
 
 
 def validated(tree: Tree, path: Path, model: type[S]) -> tuple[S, Tree]:
-    """Validate the data read and merged from ``path``; see ``load_config``."""
+    """Validate the data merged from ``path``; see ``load_config``."""
     version = tree.data.get("version")
     if version != FILE_VERSION:
         if version is None:
@@ -636,7 +636,9 @@ def validated(tree: Tree, path: Path, model: type[S]) -> tuple[S, Tree]:
     try:
         text = json.dumps(tree.data)
     except TypeError as error:
-        raise ConfigError(f"{path}: holds a value that is neither text, number, list nor mapping: {error}") from error
+        raise ConfigError(
+            f"{path}: contains a value that is not text, a number, a list or a mapping: {error}"
+        ) from error
     except ValueError as error:
         raise ConfigError(f"{path}: {error}") from error
     try:
@@ -649,10 +651,10 @@ def validated(tree: Tree, path: Path, model: type[S]) -> tuple[S, Tree]:
 
 
 def _mixtures(config: TruckConfig, tree: Tree, path: Path) -> Iterator[str]:
-    """A line for each key of a simulation in the configuration of a robot with real ports."""
+    """Report each simulation key in the configuration of a robot with real ports."""
     for key, port, remedy in mixed(config):
         where, other = (tree.origin(place) or f"{path}:1" for place in (key, port))
-        yield f"{where}: {'.'.join(key)}: a simulation mixed with the real port {'.'.join(port)} ({other}): {remedy}"
+        yield f"{where}: {'.'.join(key)}: a simulation cannot use the real port {'.'.join(port)} ({other}): {remedy}"
 
 
 def _require_kind(data: dict[str, Any], path: Path, model: type[Schema]) -> None:
@@ -662,11 +664,13 @@ def _require_kind(data: dict[str, Any], path: Path, model: type[Schema]) -> None
     # 0.75: minimum fraction of unknown sections to reject the file as another kind of file
     if len(strange) > 1 and len(strange) >= 0.75 * len(found):
         expected = [name for name, field in model.model_fields.items() if field.is_required() and name != "version"]
-        raise ConfigError(f"{path}:1: another kind of file: expected {', '.join(expected)}, found {', '.join(found)}")
+        raise ConfigError(
+            f"{path}:1: this is another kind of file: expected {', '.join(expected)}, found {', '.join(found)}"
+        )
 
 
 def _locate_files(tree: Tree, keys: tuple[tuple[str, ...], ...]) -> None:
-    """Make the paths at ``keys`` absolute: they are relative to the file that names them."""
+    """Make the paths at ``keys`` absolute; they are relative to their file."""
     for key in keys:
         section: Any = tree.data
         for part in key[:-1]:
@@ -679,11 +683,11 @@ def _locate_files(tree: Tree, keys: tuple[tuple[str, ...], ...]) -> None:
 
 
 def _located(tree: Tree, key: tuple[str, ...], name: str) -> Path:
-    """Absolute path of the file ``name`` at ``key``, or of the folder of a saved map; noted if it is of the robot.
+    """Resolve the file ``name`` at ``key``, or the folder of a saved map; record it if it belongs to the robot.
 
     Raises:
-        ConfigError: it is not there, or is a folder.
-        OSError, ValueError: no file can have this name.
+        ConfigError: it is missing, or is a folder.
+        OSError, ValueError: the name is impossible for a file.
     """
     origin = tree.origins[key]
     file = (origin.file.parent / name).resolve()
@@ -702,7 +706,7 @@ def _located(tree: Tree, key: tuple[str, ...], name: str) -> Path:
 
 
 def _give_ports(data: dict[str, Any]) -> None:
-    """Give every device of an emulated robot that names no port the port that `simulate` makes for it."""
+    """Set the port of every device of an emulated robot without a configured port, as created by `simulate`."""
     devices = data.get("devices")
     if data.get("sim") is None or not isinstance(devices, dict):
         return
@@ -717,10 +721,10 @@ def _explain(tree: Tree, path: Path, model: type[Schema], error: ValidationError
     wrong = {detail["loc"][:depth] for detail in details for depth in range(len(detail["loc"]))}
     mistakes: dict[Key, ErrorDetails] = {}
     for detail in details:
-        # entries that are wrong are not counted, so a list of them is "too short"
+        # invalid entries are not counted, so a list of them is "too short"
         if detail["type"] != "too_short" or detail["loc"] not in wrong:
             mistakes.setdefault(_data_key(tree.data, detail["loc"]), detail)  # for a union, the first member
-    most_mistakes = 50  # named at once
+    most_mistakes = 50  # reported as one
     for key, detail in list(mistakes.items())[:most_mistakes]:
         origin = tree.origin(key) or f"{path}:1"
         dotted = ".".join(map(str, key)) or "configuration"
@@ -728,7 +732,7 @@ def _explain(tree: Tree, path: Path, model: type[Schema], error: ValidationError
     if (more := len(mistakes) - most_mistakes) > 0:
         yield f"{path}: {more} more mistakes"
     if {"extra_forbidden", "union_tag_invalid"} & {detail["type"] for detail in mistakes.values()}:
-        yield from (f"plug-in left out: {broken}" for broken in left_out())
+        yield from (f"plug-in skipped: {broken}" for broken in left_out())
 
 
 def _first_mistake(data: Any, error: ValidationError) -> str:
@@ -742,11 +746,13 @@ def _sentence(detail: ErrorDetails, model: type[Schema], key: Key) -> str:
     if detail["type"] == "extra_forbidden":
         known = _field_names(model, key[:-1], detail)
         close = difflib.get_close_matches(str(key[-1]), known, 1)
-        return f"unknown key (did you mean {close[0]}?)" if close else f"unknown key; known here: {', '.join(known)}"
+        return (
+            f"unknown key (did you mean {close[0]}?)" if close else f"unknown key; expected one of {', '.join(known)}"
+        )
     if detail["type"] == "missing":
         return "missing; it has no default"
     if detail["type"] == "union_tag_invalid":
-        return f"no kind {detail['ctx']['tag']!r}; expected one of {detail['ctx']['expected_tags']}"
+        return f"unknown kind {detail['ctx']['tag']!r}; expected one of {detail['ctx']['expected_tags']}"
     if detail["type"] in ("too_short", "too_long"):
         limit = "at least {min_length}" if detail["type"] == "too_short" else "at most {max_length}"
         return f"expected {limit.format_map(detail['ctx'])} in number"

@@ -1,8 +1,8 @@
 """Upgrades configuration files of older versions step by step, keeping their comments.
 
-A file without ``version`` has the version of the including file. The previous file is kept next to the new
-one as ``NAME.vN``. A file that includes others is written last: an upgrade that is interrupted can simply be repeated,
-because a step does nothing to a key that is already as it should be.
+A file without ``version`` has the version of the including file. The previous file is kept next to the new one as
+``NAME.vN``. A file that includes others is written last, so an interrupted upgrade can be repeated: a step does not
+change a key that is already current.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,13 +22,13 @@ class Upgrade:
 
     path: Path
     version: int
-    """It has now."""
+    """Current version of the file."""
     before: str
     after: str
 
     @property
     def kept(self) -> Path:
-        """Path of the previous file's copy."""
+        """Path of the copy of the previous file."""
         return self.path.with_name(f"{self.path.name}.v{self.version}")
 
 
@@ -37,11 +37,11 @@ def plan(path: Path, steps: Mapping[int, Step] = STEPS, target: int = FILE_VERSI
 
     Args:
         path: configuration file.
-        steps: the chain.
-        target: version to reach.
+        steps: migration steps.
+        target: target version.
 
     Raises:
-        ConfigError: a file is missing, is not a YAML mapping, or has no known version.
+        ConfigError: a file is missing, is not a YAML mapping, or has an unknown version.
     """
     upgrades: dict[Path, Upgrade] = {}
     _visit(path, None, steps, target, upgrades, ())
@@ -77,7 +77,9 @@ def _version(text: YamlText, inherited: int | None, steps: Mapping[int, Step], t
     if said is None or not said.isdecimal() or int(said) < min(steps):
         raise ConfigError(f"{text.path}:{line}: version: expected {min(steps)} to {target}, found {said}")
     if int(said) > target:
-        raise ConfigError(f"{text.path}:{line}: version: {said} is newer than this program, which knows up to {target}")
+        raise ConfigError(
+            f"{text.path}:{line}: version: {said} is newer than this program, which supports up to {target}"
+        )
     return int(said)
 
 
@@ -88,15 +90,15 @@ def _includes(text: YamlText) -> list[str]:
 
 
 def carry_out(upgrades: Sequence[Upgrade]) -> None:
-    """Write the files, each whole or not at all, with the previous one next to it.
+    """Write each file atomically, with its previous version next to it.
 
     Raises:
-        InputError: a previous file of another content is kept there already, or one cannot be written.
+        InputError: a different previous file already exists, or a file cannot be written.
     """
     for upgrade in upgrades:
         try:
             if upgrade.kept.exists() and upgrade.kept.read_bytes() != upgrade.before.encode():
-                raise InputError(f"{upgrade.kept}: holds another version {upgrade.version} already; move it away")
+                raise InputError(f"{upgrade.kept}: already contains another version {upgrade.version}; move it away")
             replace_file(upgrade.kept, upgrade.before)
             replace_file(upgrade.path, upgrade.after)
         except OSError as error:

@@ -1,7 +1,7 @@
-"""Settings outside of the gate that must match its speed; others are refused by name.
+"""Settings outside of the gate that must match its speed; the message names each that does not.
 
-A faster robot would fail later: its pose would stand still while it drives, or its route would end in an unseen
-obstacle. Speeds m/s, distances m.
+At a higher speed the robot would fail later: its pose would stop following it, or its route would end in an unseen
+obstacle. Speeds in m/s, distances in m.
 """
 
 from collections.abc import Iterator
@@ -14,8 +14,9 @@ from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_planners.track.config import TrackerConfig
 
 SPARE: Final = 1.25
-"""Readings of a wheel may say so much more than the gate allows: their instants are uncertain by a part of the time
-between them."""
+"""Factor by which wheel readings may exceed the gate's speed: the times of the readings are uncertain by a fraction of
+their period.
+"""
 
 
 def too_slow(
@@ -31,20 +32,23 @@ def too_slow(
 
     Args:
         speed: ``gate.speed``, m/s.
-        odometry: odometry of the robot, as all others.
-        tracker: None if there is none.
-        planner: None if there is none.
-        slam: None if there is none.
-        consistent: the sensors are compared.
+        odometry: odometry settings; other arguments likewise.
+        tracker: tracker settings; None without a tracker.
+        planner: planner settings; None without a planner.
+        slam: mapping settings; None without mapping.
+        consistent: whether the sensors are compared.
     """
     believed = getattr(odometry, "max_speed", None)
     if believed is not None and believed < SPARE * speed:
         yield f"odometry.max_speed {believed:g} m/s: expected at least {SPARE * speed:g}, {SPARE} times gate.speed"
     if slam is not None and slam.mapper.fastest[0] < SPARE * speed:
-        yield f"slam.mapper.fastest {slam.mapper.fastest[0]:g} m/s: expected at least {SPARE * speed:g}, likewise"
+        yield f"slam.mapper.fastest {slam.mapper.fastest[0]:g} m/s: expected at least {SPARE * speed:g}"
     if consistent and SPARE * speed > MAX_SPEED:
         most = MAX_SPEED / SPARE
-        yield f"gate.speed {speed:g} m/s: at most {most:g}, up to which the sensors are compared, or consistency null"
+        yield (
+            f"gate.speed {speed:g} m/s: at most {most:g}, the limit for the comparison of sensors; or set "
+            "consistency to null"
+        )
     if planner is None or tracker is None:
         return
     needed = distance_to_stop(min(speed, tracker.speed), planner, tracker)
@@ -54,12 +58,12 @@ def too_slow(
     for name, metres, share in sees:
         if metres < share * needed:
             yield (
-                f"{name} {metres:g} m: expected at least {share * needed:.2f}: the tracker stops within {needed:.2f} m "
-                f"once blocked_scans have shown that the route is blocked"
+                f"{name} {metres:g} m: expected at least {share * needed:.2f}: the tracker stops within "
+                f"{needed:.2f} m after blocked_scans have shown that the route is blocked"
             )
 
 
 def distance_to_stop(speed: float, planner: PlannerConfig, tracker: TrackerConfig) -> float:
-    """Distance from where the first scan shows the route blocked to where the tracker has stopped, m."""
+    """Distance travelled from the first scan that shows a blocked route until the tracker stops, m."""
     noticed = planner.blocked_scans / planner.rate
     return speed * noticed + speed**2 / (2 * tracker.deceleration)

@@ -1,8 +1,8 @@
-"""Calibration that the trackers propose: learnt while driving, kept over restarts, used once an operator accepts it.
+"""Calibration proposed by trackers: learnt while driving, kept across restarts, used after an operator accepts it.
 
-A tracker learns gain and trim of an axle with their covariance. Where they differ significantly from the calibration,
-the tracker proposes the pulse map that would steer the axle as requested. Until it is accepted (``calibrate accept``)
-nothing runs on it; a proposal that was learnt on another calibration than the daemon runs on is void.
+A tracker learns gain and trim of an axle with their covariance. If they differ significantly from the calibration, the
+tracker proposes the pulse map that would steer the axle as requested. Nothing uses it until an operator accepts it
+(``calibrate accept``). A proposal learnt with a calibration other than the current one is void.
 """
 
 import math
@@ -25,27 +25,27 @@ from monstertruckd.config.wizards import STEERING, WIZARDS
 WIZARD: Final = "steering"
 """Wizard whose values are proposed."""
 SPAN: Final = 0.2
-"""Axle angles to both sides over which the proposed pulse map fits best, rad; servos reach them on every truck."""
+"""Axle angles to both sides for which the proposed pulse map is fitted, rad; servos of every truck reach them."""
 HALF: Final = 1.96
-"""Half an interval of 95 % in standard deviations."""
+"""Half-width of a 95 % interval in standard deviations."""
 
 
 class _File(Schema):
-    """Content of the file."""
+    """Content of the proposal file."""
 
     base: str
-    """Calibration file that the daemon ran on; empty: none."""
+    """Calibration file used by the daemon; empty: none."""
     result: Result
 
 
 @dataclass
 class SteeringProposal:
-    """Latest proposal.
+    """Store of the latest proposal.
 
     Args:
-        config: the running one, calibration included.
-        base: calibration file that it includes; empty: none.
-        file: where the proposal is kept; None: nowhere.
+        config: running configuration, including the calibration.
+        base: calibration file in use; empty: none.
+        file: file of the proposal; None: not saved.
     """
 
     config: TruckConfig
@@ -60,7 +60,7 @@ class SteeringProposal:
         self._chassis = self.config.chassis()
 
     def load(self) -> str:
-        """Read it; may block.
+        """Read the file; may block.
 
         Returns:
             Fault of the file; empty if it is intact or missing.
@@ -68,7 +68,7 @@ class SteeringProposal:
         if self.file is None:
             return ""
         try:
-            require_file(self.file, 100_000)  # size of a proposal at most, bytes
+            require_file(self.file, 100_000)  # maximum size of a proposal, bytes
             found = _File.model_validate_json(self.file.read_bytes())
         except FileNotFoundError:
             return ""
@@ -79,14 +79,14 @@ class SteeringProposal:
         return ""
 
     def put_aside(self) -> str:
-        """Keep a damaged file under another name; may block. Returns a sentence about it."""
+        """Rename a damaged file; may block. Return a sentence about it."""
         return "" if self.file is None else put_aside(self.file)
 
     def save(self) -> None:
-        """Write it, or remove its file if there is none; may block.
+        """Write the file, or remove it without a proposal; may block.
 
         Raises:
-            OSError: it cannot be written.
+            OSError: the file cannot be written.
         """
         if self.file is None:
             return
@@ -100,8 +100,8 @@ class SteeringProposal:
         """Propose a tracker's estimate if it differs from the current proposal; return whether it does.
 
         Args:
-            state: latest of the tracker.
-            date: now, UTC.
+            state: latest state of the tracker.
+            date: current time, UTC.
         """
         if self._closed or not WIZARDS[WIZARD].fits(self.config):
             return False
@@ -140,11 +140,11 @@ class SteeringProposal:
         if centre is None or scale is None or direction is None:
             return ()
         wanted = np.linspace(-SPAN, SPAN, 21)
-        # An axle that is to stand at `wanted` has to be asked for this.
+        # To reach `wanted`, the axle must be commanded this angle.
         asked = (wanted - row.trim) / row.gain
         right, sent = (np.degrees([self._servo(row.axle, angle) for angle in angles]) for angles in (wanted, asked))
         slope, begin = np.polyfit(right, sent, 1).tolist()
-        by_angle = (right[-1] - right[0]) / (2 * SPAN)  # degrees of the servo for each rad of the axle
+        by_angle = (right[-1] - right[0]) / (2 * SPAN)  # degrees of servo angle per radian of axle angle
         centre_half = HALF * scale * slope * by_angle * row.trim_deviation
         scale_half = HALF * scale * slope * row.gain_deviation / abs(row.gain)
         values = (

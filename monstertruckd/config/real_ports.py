@@ -1,7 +1,7 @@
-"""Real ports: which devices hang on this computer itself, and what such a robot may not have.
+"""Real ports: devices connected to this computer, and settings that a robot with real ports must not have.
 
 A robot is either emulated, with a section ``sim`` and every device behind an emulator, or real. A mixture would drive
-the real motor by a simulation's start pose, path and timing.
+the real motor with the start pose, path and timing of a simulation.
 """
 
 import os
@@ -14,11 +14,11 @@ from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruckd.config.truck import TruckConfig
 
 PSEUDO: Final = (Path("/dev/pts"), Path("/dev/shm"))  # noqa: S108 - nothing is put there
-"""Folders below /dev whose entries are not devices: pseudo terminals, which emulators serve, and memory."""
+"""Folders in /dev whose entries are not devices: pseudo terminals, used by emulators, and memory."""
 
 
 def real_ports(config: TruckConfig) -> tuple[str, ...]:
-    """Roles of the devices that are real: by hub on its own USB tree, by a node below /dev, or at another address.
+    """Roles of the real devices: by hub on the computer's USB tree, by a node in /dev, or at another address.
 
     Links are followed. A port that does not exist yet is judged by its name.
     """
@@ -27,10 +27,10 @@ def real_ports(config: TruckConfig) -> tuple[str, ...]:
 
 
 def mixed(config: TruckConfig) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], str]]:
-    """Keys that describe a simulation although a device has a real port.
+    """Keys of a simulation in a configuration with a real port.
 
     Yields:
-        The key, the key of the first real port, and what to do.
+        The key, the key of the first real port, and the remedy.
     """
     roles = real_ports(config)
     if not roles:
@@ -40,10 +40,10 @@ def mixed(config: TruckConfig) -> Iterator[tuple[tuple[str, ...], tuple[str, ...
         yield (
             ("sim",),
             port,
-            "leave out what has `sim`, or give every device an emulated port, as configs/truck_emulated.yaml does",
+            "remove the files with `sim`, or give every device an emulated port, as configs/truck_emulated.yaml does",
         )
     if config.stand == "simulator":
-        yield ("stand",), port, "expected none or overhead of a real robot"
+        yield ("stand",), port, "for a real robot, expected none or overhead"
 
 
 def _is_real(port: AnyPort, *, own_tree: bool) -> bool:

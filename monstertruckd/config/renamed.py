@@ -1,4 +1,4 @@
-"""Keys that older versions called otherwise: one table for configuration files, saved settings and calibrations."""
+"""Keys renamed since older versions: one table for configuration files, saved settings and calibrations."""
 
 from collections.abc import Sequence
 from typing import Final

@@ -1,4 +1,4 @@
-"""Start of a daemon: its configuration, with saved settings and calibration as far as their files are usable."""
+"""Start of a daemon: its configuration, with saved settings and calibration if their files are usable."""
 
 from collections.abc import Awaitable, Callable, Iterable
 from functools import partial
@@ -16,17 +16,17 @@ T = TypeVar("T", bound=TruckConfig)
 
 
 class LeftOut(NamedTuple):
-    """An unusable file that the daemon starts without."""
+    """A damaged or invalid file that the daemon ignores at its start."""
 
     file: Path
     source: str
-    """Service whose values they are."""
+    """Service that uses its values."""
     text: str
-    """Damage and replacement of the file; after ``set_aside`` also the name under which it is kept."""
+    """Damage, and replacement values; after ``set_aside`` also the new name of the file."""
 
 
 def started(config: T, tree: Tree) -> tuple[T, Tree, tuple[LeftOut, ...]]:
-    """Return the configuration as ``calibrated`` does, without saved settings and calibrations that cannot be used.
+    """Return the configuration as ``calibrated`` does, without unusable saved settings and calibrations.
 
     The configuration's settings replace saved ones, and the previous calibration replaces a damaged one. The files
     keep their names until ``set_aside``.
@@ -44,27 +44,28 @@ def started(config: T, tree: Tree) -> tuple[T, Tree, tuple[LeftOut, ...]]:
 
 def _left_out(error: UnusableFileError, settings: Path) -> LeftOut:
     if error.file == settings:
-        source, instead = ServiceName.GATE.value, "the settings of the configuration count"
+        source, instead = ServiceName.GATE.value, "the values of the configuration are used"
     else:
-        source, instead = ServiceName.CALIBRATION.value, "the calibration before it counts, if there is one"
+        source, instead = ServiceName.CALIBRATION.value, "the previous calibration is used, if there is one"
     return LeftOut(error.file, source, f"{error}; {instead}")
 
 
 async def set_aside(
     left_out: Iterable[LeftOut], store_stop: Callable[[], Awaitable[bool]], offload: Offload
 ) -> tuple[LeftOut, ...]:
-    """Rename files that are left out, so that they are kept and later saves do not fail by them; see ``put_aside``.
+    """Rename ignored files, so that they are kept and do not block later saves; see ``put_aside``.
 
-    The latched emergency stop is stored first: otherwise a start that dies here is followed by one that does not stop.
+    The latched emergency stop is stored first: if this start crashed afterwards, the next would otherwise begin without
+    the stop.
 
     Args:
-        left_out: the files.
-        store_stop: stores the latched stop; False if it could not.
-        offload: where files are renamed.
+        left_out: ignored files.
+        store_stop: stores the latched stop; returns False on failure.
+        offload: runs the renaming of files.
     """
     files = tuple(left_out)
     if not files:
         return ()
     if not await store_stop():
-        return tuple(one._replace(text=f"{one.text}; the file stays until the stop can be stored") for one in files)
+        return tuple(one._replace(text=f"{one.text}; the file remains until the stop can be stored") for one in files)
     return tuple([one._replace(text=f"{one.text}; {await offload(partial(put_aside, one.file))}") for one in files])

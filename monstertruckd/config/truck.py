@@ -48,36 +48,38 @@ from monstertruckd.gate.hand import HandConfig
 from monstertruckd.recorder.config import BlackBoxConfig, MapRender, RecorderConfig
 
 ROBOT: Final = "truck"
-"""A robot's name where none is given."""
-BLIND: Final = "devices: no range sensor: nothing stops the robot before an obstacle"
+"""Default name of a robot."""
+BLIND: Final = "devices: no range sensor: the robot does not stop for obstacles"
 
-UNCOMPARED: Final = "consistency null: sensors that lie are not found"
+UNCOMPARED: Final = "consistency null: sensors with wrong readings are not found"
 
 MOVE: Final = "move"
-"""Name of the behaviour that every robot has."""
+"""Name of the behaviour of every robot."""
 DOCKING: Final = {"dock": DockingConfig, "undock": UndockConfig}
-"""Behaviours that every robot with docks has."""
+"""Behaviours of every robot with docks."""
 
 
 class Geometry(Schema):
-    """The truck's body (navigation-relevant lengths, author's robot as default)."""
+    """Dimensions of the truck's body (default: the author's robot)."""
 
     wheelbase: Metres = 0.32
-    """Metres between front and rear axle; of a body without axles, the length of the bicycle that requests speak of"""
+    """Distance between front and rear axle, m; for a body without axles, the wheelbase of the bicycle model used in
+    requests
+    """
     track: Metres = 0.26
-    """Metres between left and right wheel centres"""
+    """Distance between left and right wheel centres, m"""
     wheel_radius: Metres = 0.075
-    """Metres"""
+    """Wheel radius, m"""
     drive_ratio: Annotated[float, Field(ge=1, le=5000)] = 644.0
     """Motor turns per wheel turn"""
     length: Metres = 0.47
-    """Metres, bumper to bumper"""
+    """Length over the bumpers, m"""
     width: Metres = 0.34
-    """Metres, over the wheels"""
+    """Width over the wheels, m"""
     mass: Annotated[float, Field(gt=0, le=1000)] = 7.25
-    """Kilograms"""
+    """Mass, kg"""
     pull: Annotated[float, Field(gt=0, le=10_000)] = 25.0
-    """Newtons: greatest force of all driven wheels at the ground, as where the slipper clutch slips"""
+    """Maximum total force of all driven wheels at the ground, N, such as the slip limit of the clutch"""
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
@@ -96,28 +98,29 @@ class Geometry(Schema):
 
 
 class PathConfig(Schema):
-    """A path drawn beforehand: started by name, or by arming alone where the robot is emulated."""
+    """A path drawn in advance: started by name or, for an emulated robot, by arming."""
 
     file: Path
     """CSV with the header x,y,yaw,direction: metres, metres, radians, +1 or -1"""
     closed: bool = False
-    """The path is a lap: its end is its start"""
+    """Whether the path is a closed lap"""
 
 
 class PlacementConfig(Schema):
     """Placement of planners and tracker: in the daemon's loop, in a worker, or on another machine (`plan-server`)."""
 
     planner: Literal["loop", "worker", "remote"] = "worker"
-    """`loop` is for studies only: planning blocks the control tick"""
+    """Placement of the planner; `loop` is for studies only, because planning blocks the control tick"""
     local_planner: Literal["loop", "worker", "remote"] = "worker"
-    """As `planner`"""
+    """Placement of the tracker, as `planner`"""
     tracker: Literal["loop", "worker", "remote"] = "loop"
     """As `planner`."""
     explorer: Literal["loop", "worker", "remote"] = "worker"
     """As `planner`."""
     slowness: Annotated[float, Field(gt=0, le=1000)] | Board | None = None
-    """Study, virtual clock only: all computations take so many times as long. `xu4` (5) and `pi2` (20) are estimates;
-    null = declared latencies alone, and runs are reproducible"""
+    """For studies on the virtual clock only: factor on all computing times. `xu4` (5) and `pi2` (20) are estimates;
+    null: declared latencies only, and runs are reproducible
+    """
 
 
 class TruckConfig(Schema):
@@ -130,71 +133,73 @@ class TruckConfig(Schema):
         ("zones", "keepout_mask", "map"),
         ("zones", "speed_mask", "map"),
     )
-    """Keys that name files which must exist; relative to the configuration file that names them."""
+    """Keys of files that must exist; relative to the configuration file that contains the key."""
 
     version: Literal[2]
     robot: Name = ROBOT
-    """Name of this robot in every key"""
+    """Name of this robot in all keys"""
     body: AnyBody = TruckBody()
-    """Kind of robot, with what only this kind has"""
+    """Kind of robot, with settings specific to this kind"""
     geometry: Geometry = Geometry()
     devices: Devices
     monitors: Monitors = Monitors()
     usb: UsbConfig = UsbConfig()
     machine: Path = Path("/")
-    """Folder that holds proc, sys and dev of the computer, or of a simulated computer"""
+    """Folder that contains proc, sys and dev of the computer, or of a simulated computer"""
     levelling: AnyLevelling = StabiliserConfig()
-    """How the stabiliser follows the compass, where there are both"""
+    """How the stabiliser follows the compass, if both exist"""
     gate: GateConfig = GateConfig()
     hand: HandConfig = HandConfig()
     """Use of the operator's radio control (`devices.hand`)"""
     checks: dict[Name, AnyCheck] = Field(default_factory=dict)
-    """Checks by name that make the safety gate stricter"""
+    """Additional checks of the safety gate, by name; they can only make it stricter"""
     odometry: AnyOdometry = OdometryConfig()
     """Dead reckoning, or the fusion of wheels, compass and scans"""
     tracker: AnyTracker | None = None
     """Tracker of paths; null: the robot follows none."""
     planner: PlannerConfig | None = None
-    """How goals are reached; null = the robot follows paths only"""
+    """How the robot drives to goals; null: it only follows given paths"""
     explorer: AnyExplorer | None = None
-    """How unknown ground is explored; null = the robot does not explore"""
+    """How the robot explores unknown ground; null: it does not explore"""
     behaviours: dict[Name, AnyBehaviour] = Field(default_factory=dict, validate_default=True)
-    """Reactive behaviours (without a path) by name; started by `behave start`. `move` is always there"""
+    """Reactive behaviours (without a path) by name; started by `behave start`. `move` always exists"""
     docks: dict[Name, DockConfig] = Field(default_factory=dict)
-    """Docks by name; with any, the behaviours `dock` and `undock` are there"""
+    """Docks by name; with any dock, the behaviours `dock` and `undock` exist"""
     lidar_sonars: LidarSonarsConfig | None = None
-    """Sonars computed from the lidar, for behaviours of a robot without sonars; null for none"""
+    """Sonar ranges computed from the lidar, for behaviours of a robot without sonars; null: none"""
     peers: dict[Name, PeerConfig] = Field(default_factory=dict)
     """Other robots whose poses are received, by name, for behaviours such as `follow`"""
     placement: PlacementConfig = PlacementConfig()
     path: PathConfig | None = None
     map: MapRender | None = None
     slam: SlamConfig | None = None
-    """Mapping, or localisation in a saved map, by the lidar; null = the pose in map is odometry"""
+    """Mapping, or localisation in a saved map, by the lidar; null: the pose in map is odometry"""
     consistency: ConsistencyConfig | None = ConsistencyConfig()
-    """Comparison of the sensors' measures of motion, which reveals false sensors; null for none"""
+    """Comparison of independent motion measurements, which reveals wrong sensors; null: none"""
     ground: GroundConfig | None = GroundConfig()
-    """Tilt and roughness of the ground, for the routes of a robot with a compass; null for none"""
+    """Tilt and roughness of the ground, for the routes of a robot with a compass; null: none"""
     points: PointsConfig | None = None
-    """Points of interest in the map: tags that the camera sees (extra vision), and marked places; null for none"""
+    """Points of interest in the map: tags seen by the camera (extra vision), and marked places; null: none"""
     zones: ZonesConfig | None = None
-    """Keepout and speed zones of the map; null for none, and operators cannot add any"""
+    """Keepout and speed zones of the map; null: none, and operators cannot add any"""
     recorder: RecorderConfig | None = None
     blackbox: BlackBoxConfig | None = BlackBoxConfig()
-    """Saves the minute before every stop by the gate; null = off"""
+    """Saves the last minute before every stop by the gate; null: off"""
     zenoh: ZenohConfig = ZenohConfig()
     state_directory: Path = Path("runs/state")
     """Folder of the e-stop latch and other state"""
     runtime_directory: Path | None = None
-    """Folder on a tmpfs for the mark of an emergency stop that is not yet on the disk; null for the service's, the
-    user's, or /run"""
+    """Folder on a tmpfs for the mark of an emergency stop that is not yet on the disk; null: the service's, the user's,
+    or /run
+    """
     calibration: Path | None = None
-    """Folder of the calibration files; null = `calibration` in the state directory"""
+    """Folder of the calibration files; null: `calibration` in the state directory"""
     stand: Literal["none", "simulator", "overhead"] = "none"
-    """Source of the true pose on `mt/stand/sensor/pose_<robot>`: recorded; of cameras, the
-    consistency check alone reads it"""
+    """Source of the true pose on `mt/stand/sensor/pose_<robot>`, which is recorded; with cameras, only the consistency
+    check uses it
+    """
     sim: Any = None
-    """The simulated side; `simulate` and `config show` check it, the daemon does not read it"""
+    """Settings of the simulation; `simulate` and `config show` check them, the daemon ignores them"""
 
     @field_validator("behaviours")
     @classmethod
@@ -206,7 +211,7 @@ class TruckConfig(Schema):
 
     @property
     def all_behaviours(self) -> dict[str, BehaviourConfig]:
-        """The configured behaviours, and the ones that docks add."""
+        """Configured behaviours, and those added by docks."""
         if not self.docks:
             return dict(self.behaviours)
         given = {name: self.behaviours.get(name, kind()) for name, kind in DOCKING.items()}
@@ -217,14 +222,14 @@ class TruckConfig(Schema):
 
     @property
     def own_planner(self) -> PlannerConfig | None:
-        """Settings of the planner that the robot itself runs; None if it has none, or ROS 2 plans."""
+        """Settings of the robot's own planner; None without one, or if ROS 2 plans."""
         return None if self.planner is None or self.planner.mode == "ros2" else self.planner
 
     def chassis(self) -> Chassis:
         """The body's kinematics.
 
         Raises:
-            KinematicsError: dimensions no robot can have.
+            KinematicsError: the dimensions are impossible.
         """
         geometry, steering = self.geometry, self.devices.steers()
         dimensions = Dimensions(
@@ -237,7 +242,7 @@ class TruckConfig(Schema):
 
     @property
     def emulated(self) -> bool:
-        """Whether every device is emulated. The section ``sim`` decides; with real ports it is refused."""
+        """Whether every device is emulated: decided by the section ``sim``, which is refused with real ports."""
         return self.sim is not None
 
     @property
@@ -247,7 +252,7 @@ class TruckConfig(Schema):
 
     @property
     def black_box_folder(self) -> Path | None:
-        """Folder of black boxes, or None."""
+        """Folder of black boxes; None without them."""
         if self.blackbox is not None and self.blackbox.directory is not None:
             return Path(self.blackbox.directory)
         return None if self.blackbox is None or self.recorder is None else Path(self.recorder.directory) / "blackbox"
@@ -288,7 +293,7 @@ class TruckConfig(Schema):
             yield from weaker("consistency", self.consistency, usual, above, ())
 
     def missing_actuators(self) -> str | None:
-        """Devices missing for the body to drive and steer."""
+        """Devices that the body needs to drive and steer, but that are missing."""
         chassis = self.chassis()
         needed = (*SHAFTS[: len(chassis.shafts)], *((DeviceRole.STEERING,) if chassis.steered else ()))
         steering = self.devices.steers()
@@ -308,7 +313,7 @@ class TruckConfig(Schema):
         for excess in (*impossible_settings(self.gate, body, times), *devices, *pace):
             raise ValueError(excess)
         if self.gate.attitude is None and self.devices.measures(COMPASS):
-            raise ValueError("gate.attitude null: a device measures the attitude; expected its limits, or no such line")
+            raise ValueError("gate.attitude null: a device measures the attitude; expected limits, or omit the line")
         self._check_planner()
         if self.behaviours.keys() - {MOVE} and (lack := self.missing_actuators()):
             raise ValueError(f"behaviours need {lack}")
@@ -371,7 +376,7 @@ class TruckConfig(Schema):
     def _check_servos(self, role: str, outputs: SteeringOutputs, chassis: Chassis) -> None:
         wanted, reaches = len(chassis.straight), outputs.reaches
         if len(reaches) != wanted:
-            has = f"has {wanted} servos" if chassis.steered else "steers nothing"
+            has = f"has {wanted} servos" if chassis.steered else "has no steering"
             raise ValueError(
                 f"body {self.body.kind} {has}: expected front_right and rear_right of devices.{role}"
                 f" {'given' if wanted > len(reaches) else 'null'}"
@@ -381,7 +386,7 @@ class TruckConfig(Schema):
         if wanted > len(AXLES) and (reach := min(abs(end) for ends in reaches for end in ends)) < WHEEL_REACH - 1e-3:
             raise ValueError(
                 f"devices.{role}: pulses reach {math.degrees(reach):.0f} degrees to one side: expected "
-                f"{math.degrees(WHEEL_REACH):.0f} of wheels that are steered one by one"
+                f"{math.degrees(WHEEL_REACH):.0f} for individually steered wheels"
             )
 
     def _check_slam(self) -> None:
@@ -402,13 +407,13 @@ class TruckConfig(Schema):
         if planner.mode == "ros2":
             if not self.gate.remote_trackers:
                 raise ValueError(
-                    "planner.mode ros2 needs gate.remote_trackers: the node that drives, such as ros2:velocity_smoother"
+                    "planner.mode ros2 needs gate.remote_trackers: the driving node, such as ros2:velocity_smoother"
                 )
             return
         if self.tracker is None:
             raise ValueError("a planner needs a tracker, which follows its routes")
         if self.slam is None and planner.map is None:
-            raise ValueError("a planner needs a map: planner.map, or slam that makes or has one")
+            raise ValueError("a planner needs a map: set planner.map, or a slam mode that builds or loads one")
         if planner.angle > self.tracker.angle:
             raise ValueError(f"planner.angle {planner.angle} rad: expected at most tracker.angle, {self.tracker.angle}")
         chassis = self.chassis()
@@ -425,6 +430,6 @@ class TruckConfig(Schema):
         ):
             if promised > (braking := train.speed(rate)):
                 raise ValueError(
-                    f"gate.{name} {promised} m/s^2: the {role} is configured to brake with {rate / math.tau:.4g} motor "
-                    f"turns/s^2, which is {braking:.2f} m/s^2"
+                    f"gate.{name} {promised} m/s^2: the {role} is configured to brake with "
+                    f"{rate / math.tau:.4g} motor turns/s^2, which is {braking:.2f} m/s^2"
                 )

@@ -1,9 +1,8 @@
 """The calibration wizards, each declared once: keys, lifetime, prerequisites, options and place in the order.
 
-Everything else follows from these rows: permitted changes (`calibration.py`), grades and expiry
-(`expiry.py`), the commands `calibrate NAME` and `calibrate all`. The procedure itself is a class in
-`monstertruckd/tools/calibrate/`, which is loaded when the wizard runs. Nothing is imported here, for every command line
-loads this table.
+Permitted changes (`calibration.py`), grades and expiry (`expiry.py`), and the commands `calibrate NAME` and `calibrate
+all` are derived from these rows. The procedure is a class in `monstertruckd/tools/calibrate/`, loaded when the wizard
+runs. This module imports nothing, because every command line loads this table.
 """
 
 import math
@@ -24,7 +23,7 @@ CAMERA_LENS: Final = "devices.camera.driver.lens"
 CAMERA_MOUNT: Final = "devices.camera.mount"
 
 TURN_IN_A_METRE: Final = ("differential", "skid_steer", "truck")
-"""Bodies that turn within a metre."""
+"""Bodies that can turn within one metre."""
 MOTION: Final = ("state/odometry", "state/pose")
 TAPE: Final = "Standard error of one tape reading, mm."
 HEIGHT: Final = "Standard error of a height, mm."
@@ -38,13 +37,13 @@ class Lifetime(NamedTuple):
     metres: float | None
     """Distance travelled, m; None: not limited."""
     role: str
-    """Device that was measured."""
+    """Measured device."""
     topics: tuple[str, ...]
     """Topics that depend on the result."""
 
 
 class Goal(NamedTuple):
-    """Confidence interval to be reached: its half-width, in the estimate's unit."""
+    """Target for the half-width of the confidence interval, in the estimate's unit."""
 
     half: float
     share: bool = False
@@ -70,15 +69,15 @@ class SequenceStep:
     """One run of a wizard in ``calibrate all``."""
 
     complete: str
-    """Estimate that its result has once this step is done."""
+    """Estimate that exists once this step is done."""
     needs: tuple[str, ...] = ()
-    """Steps that come before it where the robot has them, ``wizard.complete``."""
+    """Steps that must precede it if the robot has them, ``wizard.complete``."""
     rough: bool = False
-    """A first measurement as the base of the others: skipped once this wizard has a result."""
+    """Whether it is a first measurement for the other wizards: skipped once this wizard has a result."""
     options: Mapping[str, Any] = field(default_factory=dict)
-    """Other than the defaults."""
+    """Options that differ from the defaults."""
     fits: Callable[["TruckConfig"], bool] = lambda _: True
-    """Whether this step of the wizard applies to the robot."""
+    """Whether the robot needs this step."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,10 +90,11 @@ class WizardKind:
     procedure: str
     """Place ``module:Class`` of the procedure; built from the options by its ``of``, if any."""
     keys: tuple[str, ...]
-    """Values of the configuration that it may set, ``*`` for any one name; a calibration never touches any other. Where
-    two wizards measure the same value, the newer measurement counts."""
+    """Values of the configuration that it may set (``*`` matches any name). If two wizards measure the same value, the
+    newer measurement is used.
+    """
     lifetime: Lifetime
-    """Experience with such parts, not measured: tyres wear, linkages and mounts are knocked, iron changes."""
+    """Validity, from experience rather than measurement: tyres wear, linkages and mounts are knocked, iron changes."""
     goals: Mapping[str, Goal]
     """Goals by the estimate's name; ``*_x`` matches every name with that ending."""
     steps: tuple[SequenceStep, ...]
@@ -108,7 +108,7 @@ class WizardKind:
         """Return the procedure with these options.
 
         Raises:
-            InputError: options do not fit together.
+            InputError: the options are inconsistent.
         """
         from monstertruck_runtime.plugins import load  # noqa: PLC0415 - not by every command line that reads the table
 
@@ -155,7 +155,7 @@ _ROWS: Final = (
         options=(
             WizardOption("meter_error", 0.5, "Proportional error of the meter, percent.", 0, 10, scale=1e-2),
             WizardOption("meter_digits", 0.02, "Constant error of the meter, V.", 0, 1),
-            WizardOption("fresh", False, "Forget the readings of earlier runs."),
+            WizardOption("fresh", False, "Discard the readings of earlier runs."),
         ),
     ),
     WizardKind(
@@ -175,10 +175,10 @@ _ROWS: Final = (
         ),
         fits=_truck_with("drive"),
         options=(
-            WizardOption("runs", 4, "Taped runs.", 3, 50),
-            WizardOption("metres", 2.0, "Length of a run.", 0.5, 20),
+            WizardOption("runs", 4, "Number of taped runs.", 3, 50),
+            WizardOption("metres", 2.0, "Length of a run, m.", 0.5, 20),
             WizardOption("tape_error", 2.0, TAPE, 0.1, 50, scale=1e-3),
-            WizardOption("sign_only", False, "End once it is clear where forward is."),
+            WizardOption("sign_only", False, "Stop once the forward direction is known."),
         ),
     ),
     WizardKind(
@@ -199,7 +199,7 @@ _ROWS: Final = (
             "body.turn_deficit.*",
         ),
         lifetime=Lifetime(90, 10_000.0, "steering", MOTION),
-        goals={  # 0.5 degrees are 8.5 us
+        goals={  # 0.5 degrees correspond to 8.5 us
             "front_centre": Goal(8.5),
             "rear_centre": Goal(8.5),
             "front_scale": Goal(0.025, share=True),
@@ -212,14 +212,14 @@ _ROWS: Final = (
         ),
         fits=_truck_with("steering", "compass", "drive"),
         options=(
-            WizardOption("rough", False, "Directions and a first centre: before the compass is calibrated."),
-            WizardOption("strings", 3, "Straight runs along a string; 0 = no string.", 0, 20),
+            WizardOption("rough", False, "Determine directions and rough centres, before the compass is calibrated."),
+            WizardOption("strings", 3, "Number of straight runs along a string; 0: no string.", 0, 20),
             WizardOption("string_error", 3.5, STRING, 0.5, 50, scale=1e-3),
         ),
     ),
     WizardKind(
         name="compass",
-        doc="The robot's own magnetism, hard and soft iron: a circle forward and back. Asks `clear`.",
+        doc="Magnetism of the robot (hard and soft iron), from a circle driven forwards and backwards. Asks `clear`.",
         procedure="monstertruckd.tools.calibrate.compass:CompassWizard",
         keys=tuple(f"{COMPASS}.{name}" for name in ("hard_x", "hard_y", "soft_xx", "soft_xy", "soft_yy")),
         lifetime=Lifetime(90, None, "compass", ("sensor/compass", *MOTION)),
@@ -254,7 +254,7 @@ _ROWS: Final = (
         steps=(SequenceStep("wheelbase", needs=("steering.front_scale",)),),
         fits=_truck_with("steering", "compass", "drive"),
         options=(
-            WizardOption("rounds", 1, "Squares to each side.", 1, 10),
+            WizardOption("rounds", 1, "Number of squares in each direction.", 1, 10),
             WizardOption("side", 1.5, "Straight part of a side, m.", 0.5, 10),
             WizardOption("tape_error", 2.0, TAPE, 0.1, 50, scale=1e-3),
             WizardOption("string_error", 3.5, STRING, 0.5, 50, scale=1e-3),
@@ -276,7 +276,7 @@ _ROWS: Final = (
             "roll": Goal(0.0087),
             "pitch": Goal(0.0087),
         },
-        steps=(  # a stabiliser's zeros level the lidar; without one its own tilt is measured
+        steps=(  # a stabiliser's zeros level the lidar; without one the lidar's own tilt is measured
             SequenceStep(
                 "pitch",
                 needs=("odometry.wheelbase",),
@@ -291,8 +291,8 @@ _ROWS: Final = (
         ),
         fits=_truck_with("lidar", "compass"),
         options=(
-            WizardOption("rounds", 1, "Full circles to each side, in quarters.", 1, 10),
-            WizardOption("heights", False, "Ask for the beam's heights: pitch and roll."),
+            WizardOption("rounds", 1, "Number of full circles in each direction, driven in quarters.", 1, 10),
+            WizardOption("heights", False, "Ask for the heights of the beam, to determine pitch and roll."),
             WizardOption("tape_error", 2.0, HEIGHT, 0.1, 50, scale=1e-3),
         ),
     ),
@@ -306,13 +306,14 @@ _ROWS: Final = (
         steps=(SequenceStep("rate_scale", needs=("odometry.wheelbase",)),),
         fits=_truck_with("imu"),
         options=(
-            WizardOption("rounds", 2, "Full circles to each side.", 1, 10),
-            WizardOption("still", False, "Biases only: nothing moves, the scale stays."),
+            WizardOption("rounds", 2, "Number of full circles in each direction.", 1, 10),
+            WizardOption("still", False, "Measure biases only: the robot does not move, the scale is kept."),
         ),
     ),
     WizardKind(
         name="slip",
-        doc="Turning centres and wheels of a skid-steer body: arcs seen by a test stand, or in the map. Asks `clear`.",
+        doc="Turning centres and wheel radii of a skid-steer body, from arcs observed by a test stand or in "
+        "the map. Asks `clear`.",
         procedure="monstertruckd.tools.calibrate.slip:SlipWizard",
         keys=tuple(f"body.{name}" for name in ("icr_left", "icr_right", "icr_x", "gain_left", "gain_right")),
         lifetime=Lifetime(90, 5_000.0, "wheels", MOTION),
@@ -328,7 +329,7 @@ _ROWS: Final = (
             WizardOption(
                 "by", "stand", "Reference for the robot's pose: stand, or pose (in its map).", choices=("stand", "pose")
             ),
-            WizardOption("rounds", 2, "Times that each arc is driven to and fro.", 1, 20),
+            WizardOption("rounds", 2, "Number of times each arc is driven there and back.", 1, 20),
         ),
     ),
     WizardKind(
@@ -354,7 +355,7 @@ _ROWS: Final = (
         steps=(SequenceStep("cone", needs=("odometry.wheelbase", "slip.icr_left")),),
         fits=lambda config: "sonar" in config.devices.present() and config.body.kind in TURN_IN_A_METRE,
         options=(
-            WizardOption("turn", 360.0, "Turn of each arc, degrees.", 190, 720, scale=math.pi / 180),
+            WizardOption("turn", 360.0, "Angle of each arc, degrees.", 190, 720, scale=math.pi / 180),
             WizardOption("tape_error", 2.0, "Standard error of the distance, mm.", 0.1, 50, scale=1e-3),
         ),
     ),
@@ -384,7 +385,7 @@ _ROWS: Final = (
         goals={
             "focal_x": Goal(0.01, share=True),
             "focal_y": Goal(0.01, share=True),
-            "centre_x": Goal(4.6),  # 0.5 degrees are 4.6 of 522 pixels
+            "centre_x": Goal(4.6),  # 0.5 degrees correspond to 4.6 of 522 pixels
             "centre_y": Goal(4.6),
             "x": Goal(0.015),
             "y": Goal(0.015),
@@ -396,12 +397,12 @@ _ROWS: Final = (
         steps=(SequenceStep("focal_x", needs=("lidar.pitch", "lidar.x")),),
         fits=_has_lens,
         options=(
-            WizardOption("columns", 8, "Squares of the board, across.", 4, 30),
-            WizardOption("rows", 6, "Squares of the board, down.", 4, 30),
-            WizardOption("square", 40.0, "Side of a square as printed, mm.", 5, 1000, scale=1e-3),
-            WizardOption("marker", 30.0, "Side of a marker as printed, mm.", 4, 1000, scale=1e-3),
+            WizardOption("columns", 8, "Number of squares across the board.", 4, 30),
+            WizardOption("rows", 6, "Number of squares down the board.", 4, 30),
+            WizardOption("square", 40.0, "Printed side length of a square, mm.", 5, 1000, scale=1e-3),
+            WizardOption("marker", 30.0, "Printed side length of a marker, mm.", 4, 1000, scale=1e-3),
             WizardOption("lens_only", False, "Calibrate the lens only, not the mount."),
-            WizardOption("patience", 60.0, "Seconds without anything new that end it.", 5, 3600),
+            WizardOption("patience", 60.0, "Seconds without a new view after which the wizard stops.", 5, 3600),
         ),
         extra="vision",
     ),
@@ -424,7 +425,10 @@ class WizardRun(NamedTuple):
 
 
 def sequence() -> Iterator[WizardRun]:
-    """Yield all steps in the order of ``calibrate all``: after those they need, else in the order of the wizards."""
+    """Yield all steps in the order of ``calibrate all``.
+
+    After the steps they need, otherwise in the order of the wizards.
+    """
     runs = {f"{row.name}.{step.complete}": WizardRun(row, step) for row in _ROWS for step in row.steps}
     done: set[str] = set()
 

@@ -295,7 +295,10 @@ class GateConfig(Schema):
         if self.obstacle.crawl >= self.speed:
             raise ValueError(f"obstacle.crawl {self.obstacle.crawl} m/s: expected less than speed, {self.speed} m/s")
         if self.short_faults_within < self.short_faults:
-            msg = f"short_faults_within {self.short_faults_within} s: expected a second for each of {self.short_faults}"
+            msg = (
+                f"short_faults_within {self.short_faults_within} s: expected at least one second for each of "
+                f"{self.short_faults}"
+            )
             raise ValueError(msg)
         if max(vars(self.leases).values()) >= self.disarm_after:
             raise ValueError(f"disarm_after {self.disarm_after} s: expected more than every lease")
@@ -353,25 +356,25 @@ def impossible_settings(config: GateConfig, body: BodyLimits, times: Iterable[tu
     for name in ("acceleration", "deceleration", "quick_deceleration"):
         if getattr(config, name) > body.acceleration + rounding:
             yield (
-                f"gate.{name} {getattr(config, name):g} m/s^2: at most {body.acceleration:.2f}, what {body.pull:g} N "
-                f"and the grip of the wheels do to {body.mass:g} kg"
+                f"gate.{name} {getattr(config, name):g} m/s^2: at most {body.acceleration:.2f}, the "
+                f"acceleration by {body.pull:g} N and the grip of the wheels at {body.mass:g} kg"
             )
     if body.motor_speed is not None and config.speed > body.motor_speed + rounding:
-        yield f"gate.speed {config.speed:g} m/s: at most {body.motor_speed:.3f}, the speed at the motor's greatest rate"
+        yield f"gate.speed {config.speed:g} m/s: at most {body.motor_speed:.3f}, the speed at the motor's maximum rate"
     if config.reverse_speed > config.speed:
         yield f"gate.reverse_speed {config.reverse_speed:g} m/s: at most gate.speed, {config.speed:g}"
     seen = body.length if body.sight is None else body.sight
     needed = stopping_distance(config)
     if needed > seen:
-        whose = "its own length, as it has no lidar" if body.sight is None else "what the lidar is sure to see"
+        whose = "its own length, as it has no lidar" if body.sight is None else "the lidar's reliable range"
         yield (
-            f"gate.speed {config.speed:g} m/s: with gate.scan.stale_after, max_latency, reaction and deceleration the "
-            f"robot stands after {needed:.3g} m: at most {seen:.2f} m, {whose}"
+            f"gate.speed {config.speed:g} m/s: with gate.scan.stale_after, max_latency, reaction and "
+            f"deceleration the robot stops within {needed:.3g} m: at most {seen:.2f} m, {whose}"
         )
     longest = body.length / config.speed
     for name, seconds in (*unattended(config), *times):
         if seconds > longest:
-            yield f"{name} {seconds:g} s: at most {longest:.2f} s, as long as its own length takes at gate.speed"
+            yield f"{name} {seconds:g} s: at most {longest:.2f} s, the time to travel the robot's length at gate.speed"
     yield from _beyond_checks(config)
 
 
@@ -512,7 +515,7 @@ def weakened(config: GateConfig) -> tuple[str, ...]:
     if config.obstacle.unseen == "slow":
         texts.append("gate.obstacle.unseen slow: the robot drives into ground that no sensor has seen")
     if config.obstacle.open_ground:
-        texts.append("gate.obstacle.open_ground true: a scan without any range counts as free ground")
+        texts.append("gate.obstacle.open_ground true: a scan without any range is treated as free ground")
     if more := sorted(set(config.tolerated_failures) - set(default.tolerated_failures)):
         texts.append(f"gate.tolerated_failures: {', '.join(more)} may fail while the robot drives")
     if config.remote_trackers:

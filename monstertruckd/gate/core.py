@@ -331,7 +331,7 @@ class Gate:
         if (why := self._impossible(request)) is not None:
             return self._refuse(now, Reason.IMPOSSIBLE_MOTION, request, why)
         if request.form is DriveForm.SHAFTS and (inside or request.role not in OPERATORS):
-            text = "a request by shafts: open loop is for people, not for planners and trackers"
+            text = "a request by shaft speeds: open loop is for operators, not for planners and trackers"
             return self._refuse(now, Reason.BAD_ROLE, request, text)
         source = self._sources.add(request, now, inside=inside)
         if self.mode is GateMode.ESTOPPED:
@@ -349,7 +349,7 @@ class Gate:
         """Why the body cannot perform this motion; None if it can do it or a similar motion."""
         forms = self._chassis.forms
         if request.form not in forms:
-            return f"a request by {request.form}: this body takes {' or '.join(sorted(forms))}"
+            return f"a request by {request.form}: this body accepts {' or '.join(sorted(forms))}"
         try:
             self._motion.target(request)
         except KinematicsError as error:
@@ -374,7 +374,7 @@ class Gate:
         if reason is not Reason.OK:
             return self._refuse_order(now, reason, request)
         if stopped_by := self._sources.overtaken(request):
-            text = f"{stopped_by} has ordered a stop meanwhile"
+            text = f"{stopped_by} has ordered a stop in the meantime"
             return self._refuse_order(now, Reason.BAD_SEQUENCE, request, text)
         if order is Order.DISARM:
             return self._disarm_by(request, now)
@@ -419,7 +419,7 @@ class Gate:
             if speed is None:
                 return self._refuse_blocked(now, (Reason.DRIVE_STALE,), request)
             if self._samples.at_rest(now):
-                text = "the drive reads standstill, but the robot moves"
+                text = "the drive reports standstill, but the robot moves"
                 return self._refuse_order(now, Reason.UNCOMMANDED_MOTION, request, text)
             return self._refuse_order(now, Reason.NOT_ARMED_SPEED, request, f"the robot moves at {speed:.2f} m/s")
         if sources := self._sources.requesting_motion(now):
@@ -466,7 +466,7 @@ class Gate:
         if blocks := self._blocks(now):
             return self._refuse_blocked(now, blocks, request)
         if self.mode is GateMode.STOPPING:
-            return self._refuse_order(now, Reason.NOT_ARMED_SPEED, request, "the robot still stops")
+            return self._refuse_order(now, Reason.NOT_ARMED_SPEED, request, "the robot is still stopping")
         if refusal := self._refuse_moving(now, request):
             return refusal
         self._sources.release(planners=not request.hold)
@@ -476,21 +476,21 @@ class Gate:
     def _ask(self, request: ControlRequest, now: int) -> Decision:
         holder = self._states.holder
         if holder is None or holder.inside:
-            return self._refuse_order(now, Reason.NOT_FOUND, request, "no operator drives who could hand over")
+            return self._refuse_order(now, Reason.NOT_FOUND, request, "no operator is driving who could hand over")
         if holder.request.source == request.source:
-            return self._refuse_order(now, Reason.BUSY, request, f"{request.source} drives already")
+            return self._refuse_order(now, Reason.BUSY, request, f"{request.source} already drives")
         self._sources.ask(request.source, now)
-        text = f"{request.source} asks {holder.request.source} to hand over"
+        text = f"{request.source} requests control from {holder.request.source}"
         self._events.emit(now, Reason.DRIVE_ASKED, Severity.INFO, text, source=request.source)
         return ACCEPTED
 
     def _hand_over(self, request: ControlRequest, now: int) -> Decision:
         holder = self._states.holder
         if holder is None or holder.inside or holder.request.source != request.source:
-            return self._refuse_order(now, Reason.BAD_ROLE, request, "only the operator who drives can hand over")
+            return self._refuse_order(now, Reason.BAD_ROLE, request, "only the driving operator can hand over")
         asking = self._sources.asking(now)
         if request.to not in asking or request.to is None:
-            text = f"to {request.to}: expected one who asks: {', '.join(asking) or 'nobody does'}"
+            text = f"to {request.to}: expected an operator who requested control: {', '.join(asking) or 'none did'}"
             return self._refuse_order(now, Reason.BAD_INPUT, request, text)
         text = f"{request.source} hands over to {request.to}"
         self._sources.hand_over(holder, request.to, now)

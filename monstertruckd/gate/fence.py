@@ -75,7 +75,7 @@ class FenceCheck(Check):
 
     def text(self, reason: Reason) -> str:
         """Fence ahead, or lack of a fresh pose."""
-        return "the fence is ahead" if self._free is not None else "no fresh pose to keep inside the fence"
+        return "the fence is ahead" if self._free is not None else "no fresh pose to check against the fence"
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
         """Distance to the fence."""

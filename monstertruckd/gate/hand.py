@@ -1,9 +1,9 @@
-"""Radio control of the operator beside the robot: the driving role with the highest priority.
+"""Radio control of an operator next to the robot: the driving role with the highest priority.
 
 - The arm switch of the transmitter is a key: while it is off, the robot does not drive, even if another operator has
   armed it. Switching it from off to on is the order to arm.
 - While the arm switch and the drive switch (if fitted) are on, the sticks drive.
-- While the emergency stop switch is on, the robot stays emergency-stopped, whoever resets it.
+- While the emergency stop switch is on, the robot stays emergency-stopped, even if another operator resets it.
 - Loss of the transmitter stops and disarms the robot, whichever source drives. After its return the arm switch must be
   seen off before it can arm the robot.
 """
@@ -30,7 +30,7 @@ MOBILE: Final = frozenset({GateMode.ARMED, GateMode.DRIVING})
 
 
 class HandConfig(Schema):
-    """Radio control of the operator beside the robot (`devices.hand`)."""
+    """Radio control of an operator next to the robot (`devices.hand`)."""
 
     speed: Annotated[float, Field(gt=0, le=10)] = 0.2
     """Speed at full stick deflection, m/s"""
@@ -92,13 +92,13 @@ class HandPolicy:
     def _lost(self, controls: HandControls | None, now: int) -> str | None:
         config = self._config
         if controls is None:
-            return "nothing heard of the receiver"
+            return "no data from the receiver yet"
         if now - controls.received > config.lost_after * SECOND:
-            return f"the receiver is silent for more than {config.lost_after:g} s"
+            return f"the receiver has been silent for more than {config.lost_after:g} s"
         if controls.lost:
-            return "the receiver does not hear its transmitter"
+            return "the receiver has lost the transmitter"
         if controls.link_quality is not None and controls.link_quality < config.quality:
-            return f"link quality {controls.link_quality:.0%}, at least {config.quality:.0%} is needed"
+            return f"link quality {controls.link_quality:.0%}: at least {config.quality:.0%} is needed"
         return None
 
     def _stop(self, mode: GateMode | None, now: int) -> tuple[Order, ...]:
@@ -203,6 +203,6 @@ class HandService:
             return
         self._lost = lost
         if lost is None:
-            self._events(Reason.DEVICE_READY, Severity.INFO, self.name, "the radio control is there")
+            self._events(Reason.DEVICE_READY, Severity.INFO, self.name, "the radio control is connected")
         else:
             self._events(Reason.DEVICE_LOST, Severity.WARNING, self.name, f"radio control lost: {lost}")

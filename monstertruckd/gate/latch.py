@@ -86,7 +86,7 @@ class Mark:
         status = os.fstat(self._file)
         if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid() or status.st_nlink != 1:
             os.close(self._file)
-            raise PermissionError(f"{path} is not a file of this user alone")
+            raise PermissionError(f"{path} is not a file owned by this user alone")
         if status.st_size == 0:
             self.set(marked=False)  # reserves space for the byte
 

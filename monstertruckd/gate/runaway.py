@@ -38,13 +38,13 @@ LEAK: Final = 0.1
 class RunawayKind(StrEnum):
     """How a motion departs from the orders; the value is the wording for messages."""
 
-    NO_ORDER = "turns without an order"
+    NO_ORDER = "turns without a command"
     DOES_NOT_STOP = "does not stop"
-    TOO_FAST = "turns faster than ordered"
-    OPPOSITE = "turns against its order"
-    VELOCITY_LIES = "turns by its position while its velocity reads 0"
-    BODY_MOVES = "stands by its own measure while the body moves"
-    STRAYS = "turned away from its goal by itself"
+    TOO_FAST = "turns faster than commanded"
+    OPPOSITE = "turns opposite to its command"
+    VELOCITY_LIES = "turns according to its position while its velocity reads 0"
+    BODY_MOVES = "reports standstill while the body moves"
+    STRAYS = "moved away from its target by itself"
 
 
 class Runaway(NamedTuple):
@@ -574,8 +574,8 @@ class RunawayCheck(Check):
             return reason.text
         done = {
             Escalation.QUICK_STOP: "quick stop",
-            Escalation.POWER_OFF: "quick stop does not help: power stage off",
-            Escalation.PORT_OFF: "nothing helps: switch the motors off by hand",
+            Escalation.POWER_OFF: "quick stop has no effect: power stage off",
+            Escalation.PORT_OFF: "no stop has an effect: switch the motors off by hand",
         }
         return f"{found.text}; {done[self._step]}"
 

@@ -107,9 +107,9 @@ class ZoneCheck(Check):
     def _lost(self, now: int) -> str:
         """Why the pose in map does not count; empty if it does."""
         if self._odometry is None or now - self._odometry.stamp > OLDEST * SECOND:
-            return "no fresh pose in the map, so zones cannot be kept"
+            return "no fresh pose in the map, so zones cannot be checked"
         why = placeless(self._slam)
-        return f"zones cannot be kept: {why}" if why else ""
+        return f"zones cannot be checked: {why}" if why else ""
 
     def reason(self, now: int) -> Iterator[Reason]:
         """Stand inside a keepout zone."""
@@ -191,9 +191,12 @@ class ZoneCheck(Check):
             return reason.text
         if self._held:
             first = self._held[0]
-            return f"in the keepout zone {', '.join(self._held)}: `monstertruckd zone off {first}` to drive out of it"
+            return (
+                f"in the keepout zone {', '.join(self._held)}: switch it off (`monstertruckd zone off "
+                f"{first}`) to drive out"
+            )
         if self._left:
-            return "in a keepout zone that the robot leaves slowly"
+            return "in a keepout zone; the robot drives out slowly"
         return self._unknown or "a keepout zone is ahead"
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:

@@ -102,7 +102,7 @@ class LogOutputThread:
         while (record := self._handler.records.get()) is not None:
             self._output.handle(record)
             if (lost := self._handler.lost) > self._reported:
-                text = f"{lost - self._reported} records lost: this output was stuck"
+                text = f"{lost - self._reported} records lost: this output was blocked"
                 self._reported = lost
                 self._output.handle(logging.LogRecord(__name__, logging.WARNING, __file__, 0, text, None, None))
 

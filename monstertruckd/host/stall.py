@@ -102,7 +102,7 @@ class StallWatch:
         except OSError as error:
             log.warning("tracebacks are in the log only: %s", error)
         else:
-            brief = f"{what}; what all threads did meanwhile is in {path}"
+            brief = f"{what}; the tracebacks of all threads at that time are in {path}"
         log.error("%s; all threads:\n%s", what, text, extra={"brief": brief})
 
     def _make_room(self) -> int:

@@ -139,7 +139,7 @@ class BlackBoxFolder:
                     box.path.unlink(missing_ok=True)
                 except OSError as error:
                     log.warning(
-                        "%s cannot be removed, though black boxes exceed their quota: %s", box.path, error.strerror
+                        "%s cannot be removed although black boxes exceed their quota: %s", box.path, error.strerror
                     )
                     continue
                 log.info("removed %s: black boxes exceed %d bytes", box.path, self._quota)
@@ -242,7 +242,7 @@ class BlackBox:
             async with self._clock.deadline(LAST_SECONDS):
                 await asyncio.shield(self._saving)
         except TimeoutError:
-            log.error("black box: the last box is lost, its disk takes longer than %g s", LAST_SECONDS)
+            log.error("black box: the last box is lost because its disk took longer than %g s", LAST_SECONDS)
         finally:
             self._given_up.set()
             for task in (self._taking, self._saving):

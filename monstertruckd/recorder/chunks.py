@@ -41,7 +41,7 @@ def unpacked(chunk: Chunk) -> bytes:
         case other:
             raise McapError(f"a chunk compressed by {other[:20]!r}: expected lz4, zstd or none")
     if len(data) != size:
-        raise McapError(f"a chunk of {'more' if len(data) > size else 'less'} than the {size} bytes it says")
+        raise McapError(f"a chunk of {'more' if len(data) > size else 'less'} than the {size} bytes in its header")
     if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
         raise McapError("checksum of a chunk")
     return data
@@ -68,5 +68,5 @@ def records_in(content: bytes) -> Iterator[McapRecord]:
             case Opcode.SCHEMA:
                 yield Schema.read(stream)
         if stream.count > end:
-            raise McapError("a record longer than it says")
+            raise McapError("a record longer than its stated length")
         stream.read(end - stream.count)

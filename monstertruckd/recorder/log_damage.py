@@ -32,9 +32,13 @@ class LogDamage:
     def losses(self) -> str:
         """Number and times of lost messages, e.g. ``at least 20 lost (2.9 to 4.0 s after its begin)``."""
         text = (
-            f"{self.lost} lost" if self.counted else f"at least {self.lost} lost" if self.lost else "perhaps some lost"
+            f"{self.lost} lost"
+            if self.counted
+            else f"at least {self.lost} lost"
+            if self.lost
+            else "an unknown number lost"
         )
-        return f"{text} ({self.times} after its begin)" if self.spans else text
+        return f"{text} ({self.times} after its start)" if self.spans else text
 
     @property
     def times(self) -> str:
@@ -48,7 +52,7 @@ def _span_text(start: float, end: float | None) -> str:
 
 def repetition(chunks: int) -> str:
     """Describe the damage of a log that holds this number of chunks twice."""
-    return f"holds {chunks} chunk{'s' if chunks > 1 else ''} twice"
+    return f"contains {chunks} chunk{'s' if chunks > 1 else ''} twice"
 
 
 def judged(salvage: Salvage) -> LogDamage:
@@ -65,7 +69,7 @@ def judged(salvage: Salvage) -> LogDamage:
     elif not salvage.indexed:
         damage.append("has a damaged index")
     elif salvage.lost:
-        damage.append(f"holds {salvage.messages} of {salvage.messages + salvage.lost} messages")
+        damage.append(f"contains {salvage.messages} of {salvage.messages + salvage.lost} messages")
     elif salvage.lacking:
         damage.append("lacks an attachment or metadata")
     return LogDamage(

@@ -53,7 +53,7 @@ def spare_log(output: Path) -> None:
     if output.is_file():
         with output.open("rb") as file:
             if file.read(len(MAGIC)) == MAGIC:
-                raise InputError(f"{output}: is a log, which is not overwritten; name another file")
+                raise InputError(f"{output}: is a log, which is not overwritten; choose another file")
 
 
 def joined(records: Iterable[McapRecord]) -> Iterator[tuple[McapMessage, Channel, Schema | None]]:
@@ -93,7 +93,7 @@ class LogMessage:
         """
         topic = BY_NAME.get(self.topic)
         if topic is None or topic.schema_name != self.schema:
-            raise NotFoundError(f"topic {self.topic!r} with schema {self.schema!r} is not one of ours")
+            raise NotFoundError(f"topic {self.topic!r} with schema {self.schema!r} is unknown")
         return wire.decode(topic, self.payload)
 
 
@@ -172,7 +172,7 @@ class LogReader:
         self.position, repeated = 0, 0
         begin = file.read(len(MAGIC))
         if begin != MAGIC:
-            raise McapError("zeros" if begin and not any(begin) else "no begin of a log")
+            raise McapError("zeros" if begin and not any(begin) else "no start of a log")
         summed = zlib.crc32(begin)
         while True:
             self.position = file.tell()
@@ -222,13 +222,13 @@ class LogReader:
         if opcode == 0:  # not an opcode: zeros of a file that lost its content in a power cut
             raise McapError("zeros")
         if opcode != Opcode.MESSAGE_INDEX and opcode < PRIVATE:
-            raise McapError(f"no record of the data section: {opcode}")
+            raise McapError(f"not a record of the data section: {opcode}")
         return ()
 
     def _checked(self, record: Attachment, content: bytes) -> Attachment:
         checked = checked_attachment(record, content)
         if checked is not record:
-            self.flaws.append(f"holds a damaged {record.name}")
+            self.flaws.append(f"contains a damaged {record.name}")
         return checked
 
     def _end(

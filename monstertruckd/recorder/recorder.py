@@ -130,7 +130,7 @@ class LogWriter:
             self._keep_quota()
             if self._file.removed and not self._removed:
                 self._removed = True
-                log.warning("%s was removed while it was written: what it held is lost", self.path)
+                log.warning("%s was removed while it was being written: its content is lost", self.path)
 
     def _is_complete(self, now: int) -> bool:
         """Whether a new file is due: by removal, size, age, or because the clock of the computer was set."""
@@ -181,7 +181,7 @@ class LogWriter:
             except OSError as error:
                 if path not in self._reported:
                     self._reported.add(path)
-                    log.warning("%s cannot be removed, though logs exceed the quota: %s", path, error.strerror)
+                    log.warning("%s cannot be removed although logs exceed the quota: %s", path, error.strerror)
                 continue
             else:
                 what = "the damaged original of a repaired log" if DAMAGED_NAME.search(path.name) else "the oldest log"

@@ -118,7 +118,7 @@ class Recordings:
             raise InputError(f"offset: expected a number of bytes, got {offset!r}")
         now = self._clock.now()
         if source != self._reader and now < self._until:
-            raise BusyError(f"{self._reader} downloads a recording: one at a time")
+            raise BusyError(f"{self._reader} is downloading a recording: wait until it ends")
         self._reader, self._until = source, now + round(TURN * SECOND)
         async with self._reading:
             await self._clock.sleep(max(self._free - self._clock.now(), 0) / SECOND)
@@ -147,7 +147,7 @@ class Recordings:
         def delete() -> Recording:
             path, row = self._find(payload)
             if _is_open(path, row):
-                raise BusyError(f"recording {row.name}: it is being written")
+                raise BusyError(f"recording {row.name}: the recorder is writing it")
             try:
                 path.unlink()
             except OSError as error:

@@ -46,7 +46,7 @@ class Recovery(LogDamage):
 
     def __str__(self) -> str:
         if self.damage is None:
-            return f"{self.path}: {self.messages} messages kept, was sound"
+            return f"{self.path}: {self.messages} messages kept, the log was intact"
         text = f"{self.path}: {self.messages} messages kept, {self.losses}; it {self.damage}"
         return text if self.original is None else f"{text}; the original is {self.original}"
 
@@ -78,7 +78,7 @@ def recover(source: str | Path, target: str | Path, stop: threading.Event | None
             raise InputError(f"{source}: is being written")
         in_place = target.exists()
         if in_place and not target.samefile(source):
-            raise InputError(f"{target}: exists already; name a new file")
+            raise InputError(f"{target}: already exists; choose another name")
         with reading(source, "an MCAP log"):
             salvage = Salvage(original)
         if salvage.strange:

@@ -251,7 +251,7 @@ class Salvage:
         elif isinstance(record, Attachment):
             checked = checked_attachment(record, part.content(self._data))
             if checked is not record:
-                self.flaws.append(f"holds a damaged {record.name}")
+                self.flaws.append(f"contains a damaged {record.name}")
             yield checked
         else:
             yield record
@@ -309,7 +309,7 @@ class _WholeRecord(NamedTuple):
             return Message.read(stream, self.length)
         record = READERS[self.opcode].read(stream)
         if stream.count != self.length:
-            raise McapError("lengths that do not add up")
+            raise McapError("inconsistent lengths")
         return record
 
 

@@ -190,10 +190,10 @@ class ActionServer(Generic[W]):
             return refused
         try:
             if not self._active():
-                raise InputError("navigation is paused: resume it by lifecycle_manager_navigation")
+                raise InputError("navigation is paused: resume it with lifecycle_manager_navigation")
             work = self._action.read(request["goal"])
             if number in self._goals:
-                raise InputError("its UUID is that of another goal")
+                raise InputError("its UUID belongs to another goal")
         except InputError as error:
             self._operators.refuse(sender.node, name, str(error))
             return refused

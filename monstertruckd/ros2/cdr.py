@@ -66,7 +66,7 @@ def decode(name: str, data: bytes) -> RosMessage:
         InputError: they are none of this interface; bytes behind its end are ignored, as ROS 2 does.
     """
     if data[:2] != HEADER[:2]:
-        raise InputError(f"{name}: expected CDR in little endian, found {data[:4].hex() or 'nothing'}")
+        raise InputError(f"{name}: expected little-endian CDR, found {data[:4].hex() or 'no data'}")
     try:
         found: RosMessage
         found, _ = _struct_reader(name)(memoryview(data)[len(HEADER) :], 0)

@@ -431,7 +431,7 @@ class RosFace:
 
     def _initial_pose(self, arrival: RosArrival) -> None:
         node = "an unknown publisher" if arrival.sender is None else arrival.sender.node
-        self._operators.refuse(node, "initialpose", "the robot finds its place by its own scans")
+        self._operators.refuse(node, "initialpose", "the robot localises itself by its own scans")
 
 
 OPTICAL: Final = "camera_optical"

@@ -115,7 +115,7 @@ class RosLocalisation:
         frame_in({"frame_id": message["child_frame_id"]}, (names.frame("base"), names.frame(FOOTPRINT)))
         stamp = stamp_of(message["header"]["stamp"]) - names.offset
         if not self._odometry or not self._odometry[0][0] <= stamp <= self._odometry[-1][0] + SECOND // 2:
-            raise InputError("its header's stamp is not one of the last 2 s, in which the robot's odometry is known")
+            raise InputError("its header's stamp is older than 2 s, for which the robot's odometry is kept")
         own = min(self._odometry, key=lambda row: abs(row[0] - stamp))[1]
         return compose(pose_in(message["pose"]["pose"]), inverse(own))
 
@@ -149,7 +149,7 @@ class RosMaps:
             frame_in(message["header"], (self._names().frame("map"),))
             x, y, yaw = pose_in(info["origin"]).tolist()
             if yaw != 0.0:
-                raise InputError(f"info.origin is turned by {yaw:.3f} rad: expected no rotation")
+                raise InputError(f"info.origin is rotated by {yaw:.3f} rad: expected no rotation")
         except InputError as error:
             self._operators.refuse(sender.node, "map", str(error))
             return

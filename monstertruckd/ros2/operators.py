@@ -48,8 +48,8 @@ def _require_recent(what: str, stamp: int, now: int) -> None:
     if abs(difference) > max_age:
         side = "behind" if difference > 0.0 else "ahead of"
         raise InputError(
-            f"{what} is {abs(difference):.1f} s {side} this clock (at most {max_age} s): an old message, or clocks "
-            "that differ; run NTP on both computers"
+            f"{what} is {abs(difference):.1f} s {side} this clock (at most {max_age} s): an old message, "
+            "or clocks that differ; run NTP on both computers"
         )
 
 
@@ -67,7 +67,7 @@ def check_arrival(arrival: RosArrival, now: int, newest: dict[bytes, int]) -> No
     _require_recent("its time of sending", arrival.stamp, now)
     before = newest.get(arrival.publisher)
     if before is not None and arrival.sequence <= before:
-        raise InputError(f"sequence number {arrival.sequence} after {before}: a repetition, or out of order")
+        raise InputError(f"sequence number {arrival.sequence} after {before}: repeated or out of order")
     newest[arrival.publisher] = arrival.sequence
 
 

@@ -109,7 +109,9 @@ class RclpyNode:
         if self._node.get_node_names_and_namespaces().count(own) > 1:
             await self.__aexit__()
             where = f"{self._namespace.rstrip('/')}/{self._name}"
-            raise BusyError(f"domain {self._domain} has a node {where} already: expected one face for a robot")
+            raise BusyError(
+                f"domain {self._domain} already has a node {where}: expected one ROS 2 bridge for each robot"
+            )
         return self
 
     @property

@@ -46,7 +46,7 @@ async def rclpy_node(name: tuple[str, str], domain: int) -> AsyncIterator[RosNod
     async with RclpyNode(name, domain) as node:
         yield node
         if node.missing:
-            log.warning("not offered, for their packages are not installed: %s", ", ".join(sorted(node.missing)))
+            log.warning("not offered because their packages are not installed: %s", ", ".join(sorted(node.missing)))
 
 
 async def serve_face(

@@ -74,7 +74,7 @@ def free_endpoint(listen: str) -> str:
             except OSError:
                 continue
             return endpoint_of(protocol, host, probe.getsockname()[1])
-    raise BusyError(f"ports {first} to {first + ports - 1} of {host} are taken: expected a free one (--listen)")
+    raise BusyError(f"ports {first} to {first + ports - 1} of {host} are taken: choose a free one (--listen)")
 
 
 class _Discovery:
@@ -173,7 +173,9 @@ class ZenohNode:
         found = [reply for reply in self._session.liveliness().get(key, timeout=0.5) if reply.ok is not None]
         if found:
             node = f"{self._namespace.rstrip('/')}/{self._name}"
-            raise BusyError(f"domain {self._domain} has a node {node} already: expected one face for a robot")
+            raise BusyError(
+                f"domain {self._domain} already has a node {node}: expected one ROS 2 bridge for each robot"
+            )
 
         def follow(sample: zenoh.Sample) -> None:
             hop.put((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))

@@ -37,7 +37,7 @@ class RobotAddress:
         if not _NAME.fullmatch(name):
             raise InputError(f"robot {text!r}: expected NAME@ENDPOINT, the name of letters, digits, _ and -")
         if at and not is_endpoint(endpoint):
-            raise InputError(f"robot {text!r}: expected an endpoint such as tcp/192.168.1.7:7447 behind the @")
+            raise InputError(f"robot {text!r}: expected an endpoint such as tcp/192.168.1.7:7447 after the @")
         return cls(name, nearest(endpoint) if at else only_robot(name, _option))
 
     @classmethod

@@ -112,7 +112,7 @@ class PagePanel:
         """
         question = self.question
         if question is None or self._answer is None or self._answer.done():
-            raise InputError("the wizard asks nothing now")
+            raise InputError("the wizard is not asking a question")
         if question["kind"] == "number" and not question["low"] <= value <= question["high"]:
             raise InputError(f"{question['name']}: expected {question['low']:g} to {question['high']:g}, got {value:g}")
         if question["kind"] == "confirm" and not isinstance(value, bool):
@@ -174,7 +174,7 @@ class Calibration:
             InputError: one runs already.
         """
         if self._task is not None and not self._task.done():
-            raise InputError(f"calibration {self._step} runs already")
+            raise InputError(f"calibration {self._step} is already running")
         self._panel, self._step, self._measured = PagePanel(self._show), step, None
         self._enter("running")
         self._task = asyncio.create_task(self._run(step, options), name=f"calibration {step}")

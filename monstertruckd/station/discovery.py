@@ -82,7 +82,7 @@ class Discovery:
         try:
             address = RobotAddress.parse(f"{name}@{self._endpoint}")
         except InputError as error:
-            log.warning("robot left out: %s", error)
+            log.warning("robot skipped: %s", error)
             return
         self._known.add(name)
         self._found(address)

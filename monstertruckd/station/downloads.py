@@ -104,10 +104,10 @@ async def _stream(
             if not data:
                 raise NotFoundError("the recording became shorter")
             if not may():
-                raise NotPermittedError("its user may no longer have it")
+                raise NotPermittedError("its user has lost the permission")
             answer = await truck.call("recording_read", {"name": name, "offset": at})
         except TruckError as error:
-            log.warning("download of %s broken off at %d of %d bytes: %s", name, at, size, error)
+            log.warning("download of %s aborted at %d of %d bytes: %s", name, at, size, error)
             raise ConnectionResetError(str(error)) from error
 
 

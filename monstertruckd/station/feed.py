@@ -245,7 +245,7 @@ class RobotFeed:
         try:
             self._facts = frames.facts(await client.call("config"), await client.call("versions"))
         except (TruckError, KeyError, TypeError, AttributeError) as error:  # the robot runs another release
-            log.warning("robot %s does not say what it is: %r", self.address.name, error)
+            log.warning("robot %s sent an invalid description: %r", self.address.name, error)
             return False
         for viewer in self._viewers:
             viewer.show("facts", self._facts)

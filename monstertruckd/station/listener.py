@@ -79,7 +79,7 @@ class WebListener:
             try:
                 taken, name = await loop.sock_accept(sock)
             except OSError as error:  # too many open files, or the peer is already gone
-                self._refused("?", f"a connection cannot be taken: {error.strerror or error}")
+                self._refused("?", f"a connection cannot be accepted: {error.strerror or error}")
                 # Pause before the next accept after running out of file descriptors (s).
                 descriptor_pause = 0.2
                 await asyncio.sleep(descriptor_pause)

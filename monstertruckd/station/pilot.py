@@ -176,7 +176,7 @@ class Pilot:
             self._viewer.send(frames.refusal(command.id, NotFoundError("no link to the robot")))
             return
         if len(self._answers) >= MOST_ASKED and not stops:
-            why = f"{MOST_ASKED} commands of this browser are under way"
+            why = f"{MOST_ASKED} commands of this browser are pending: wait for an answer"
             self._viewer.send(frames.refusal(command.id, RequestRefusedError(Reason.BUSY, why)))
             return
         task = asyncio.create_task(self._outcome(command.id, _call(client, command, self._clock)))
@@ -267,7 +267,7 @@ def read_mission(text: str) -> Mission:
         return mission_from(text, FilePath("mission.yaml"))
     try:
         if any(isinstance(event, AliasEvent) for event in YAML(typ="safe", pure=True).parse(text)):
-            raise InputError("mission: has an alias (*name): expected every value written out")
+            raise InputError("mission: contains an alias (*name): expected every value written out")
         return Mission.model_validate_json(json.dumps(YAML(typ="safe", pure=True).load(text)))
     except ValidationError as error:
         raise InputError(f"mission: {first_mistake(error)}") from error
@@ -286,9 +286,9 @@ def drawn_path(points: Sequence[tuple[float, float]]) -> Path:
     line = line[np.concatenate(([True], steps > 1e-6))]
     along = np.concatenate(([0.0], np.cumsum(steps[steps > 1e-6])))
     if along[-1] < SHORTEST:
-        raise InputError(f"path: {along[-1]:.2f} m are drawn, expected at least {SHORTEST} m")
+        raise InputError(f"path: drawn length {along[-1]:.2f} m, expected at least {SHORTEST} m")
     if along[-1] > LONGEST_DRAWN_PATH:
-        raise InputError(f"path: {along[-1]:.4g} m are drawn, expected at most {LONGEST_DRAWN_PATH:g} m")
+        raise InputError(f"path: drawn length {along[-1]:.4g} m, expected at most {LONGEST_DRAWN_PATH:g} m")
     drawn_spacing = 0.05  # distance between poses of a drawn path (m)
     places = np.linspace(0.0, along[-1], max(math.ceil(along[-1] / drawn_spacing), 2) + 1)
     even = np.column_stack([np.interp(places, along, line[:, i]) for i in (0, 1)])

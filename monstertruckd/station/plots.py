@@ -66,7 +66,7 @@ def require_numbers(names: Iterable[str]) -> None:
     """
     for name in names:
         if name not in numbers():
-            raise InputError(f"{name}: expected a number of a topic, such as state/gate:speed_limit")
+            raise InputError(f"{name}: expected a numeric field of a topic, such as state/gate:speed_limit")
 
 
 def value_in(message: Message, path: str) -> float | None:

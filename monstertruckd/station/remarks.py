@@ -48,4 +48,4 @@ class Remarks:
         counts, self._counts, self._timer = self._counts, Counter(), None
         for peer, count in counts.items():
             if count > self._burst:
-                self._log.warning("%s: %d further lines left out", printable(peer), count - self._burst)
+                self._log.warning("%s: %d further lines not logged", printable(peer), count - self._burst)

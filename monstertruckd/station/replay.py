@@ -83,7 +83,7 @@ def _decoded(rows: Iterable[Recorded]) -> Iterator[Message]:
         try:
             yield row.decode()
         except TruckError as error:
-            log.debug("message left out: %s", error)
+            log.debug("message skipped: %s", error)
 
 
 class ReplayFeed:
@@ -132,13 +132,14 @@ class ReplayFeed:
             size += len(row.payload)
             if size > most_bytes:
                 raise InputError(
-                    f"{file.name}: more than {most_bytes / 1e6:.0f} MB to be shown; see `monstertruckd replay`"
+                    f"{file.name}: more than {most_bytes / 1e6:.0f} MB, too large for the page; use "
+                    "`monstertruckd replay`"
                 )
             track.times.append(max(row.log_time, track.times[-1] if track.times else row.log_time))
             track.messages.append(row)
         filled = [track.times for track in self._tracks.values() if track.times]
         if not filled:
-            raise InputError(f"{file.name}: holds nothing that the page shows")
+            raise InputError(f"{file.name}: contains no topic that the page shows")
         return min(times[0] for times in filled), max(times[-1] for times in filled)
 
     # Browsers
@@ -184,7 +185,7 @@ class ReplayFeed:
             InputError: the recording does not hold it.
         """
         if not self.holds(stamp):
-            raise InputError(f"{self.name}: does not hold this moment")
+            raise InputError(f"{self.name}: does not contain this time")
         self.control((stamp - self._begin) / SECOND, playing=False, rate=None)
 
     def _send_all(self, viewer: Viewer) -> None:

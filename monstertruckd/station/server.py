@@ -112,7 +112,7 @@ class Place:
     def __post_init__(self) -> None:
         if self.host not in LOCAL_HOSTS and (self.tls is None or self.users is None):
             raise NotPermittedError(
-                f"host {self.host}: a page that other machines can reach needs a certificate with its key, and users"
+                f"host {self.host}: a page reachable from other machines needs a certificate with its key, and users"
             )
 
     @property
@@ -169,7 +169,7 @@ class Station:
         self.place = place
         self.feeds = {address.name: RobotFeed(address, clock) for address in robots}
         if len(self.feeds) != len(robots):
-            raise InputError("two robots of one name: expected a name of its own for each")
+            raise InputError("two robots have the same name: expected a different name for each")
         self._board = FleetBoard(self.feeds, clock)
         self._discoveries = [Discovery(endpoint, clock, self._found) for endpoint in routers]
         self._following: dict[RobotFeed | ReplayFeed, asyncio.Task[None]] = {}
@@ -239,7 +239,7 @@ class Station:
         if users is not None and await users.refresh():
             for socket, (user, transport) in self._sockets.items():
                 if not users.stands(user):
-                    text = "browser of %s is let go: no longer a user, or with another role or password"
+                    text = "browser of %s disconnected: the user was removed, or has another role or password"
                     log.warning(text, user.name)
                     task = asyncio.create_task(_let_go(socket, transport, WSCloseCode.POLICY_VIOLATION))
                     self._closing.add(task)
@@ -271,7 +271,7 @@ class Station:
         """
         name = next((name for name, feed in self.replays.items() if not feed.watched), None)
         if name is None:
-            raise InputError(f"{MOST_REPLAYS} recordings are looked at already: expected fewer at once")
+            raise InputError(f"{MOST_REPLAYS} recordings are already being replayed: close one first")
         return name
 
     def _drop_replay(self, name: str) -> None:
@@ -381,14 +381,14 @@ class Station:
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Refuse requests that other sites make a browser send."""
         if request.host not in self.place.names:
-            raise self._refused(request, f"host {request.host!r} is not this station's name")
+            raise self._refused(request, f"host {request.host!r} is not a name of this station")
         origin = request.headers.get("Origin")
         foreign = origin is not None and origin not in self.place.origins
         if foreign or (request.path == "/socket" and origin is None):
-            raise self._refused(request, f"origin {origin!r} is not this station's page")
+            raise self._refused(request, f"origin {origin!r} is not a page of this station")
         # Requests from images and links of other sites have no origin.
         if request.path != "/" and request.headers.get("Sec-Fetch-Site", OWN_SITE[0]) not in OWN_SITE:
-            raise self._refused(request, "asked for by the page of another site")
+            raise self._refused(request, "requested by a page of another site")
         if self.place.users is None:
             request[USER] = LOCAL
         else:
@@ -446,9 +446,9 @@ class Station:
         if not user.may(AccessRole.PILOT):
             raise self._refused(request, f"user {user.name!r} is {user.role.value}: expected pilot")
         if feed is None or not RECORDING.fullmatch(name):
-            self._refused(request, "expected a robot's name and that of a recording")
+            self._refused(request, "expected the names of a robot and a recording")
             raise web.HTTPNotFound
-        text = f"recording {name} of {feed.address.name} goes to {request.remote}"
+        text = f"sending recording {name} of {feed.address.name} to {request.remote}"
         self._remarks.add(request.remote, text, logging.INFO)
         users = self.place.users
 
@@ -463,7 +463,7 @@ class Station:
         user = request[USER]
         count, own = len(self._browsers), sum(each.user.name == user.name for each in self._browsers)
         if count >= MOST_BROWSERS or (user is not LOCAL and own >= MOST_OF_USER):
-            self._refused(request, f"{count} browsers are connected, {own} of this user")
+            self._refused(request, f"{count} browsers are connected, {own} of them by this user: close one first")
             raise web.HTTPServiceUnavailable(text="too many browsers", headers=HEADERS)
         name = f"{user.name}{'-' * bool(user.name)}{self._run}.{next(self._numbers)}"
         browser = _Browser(name, user, self, self._board, self._clock)
@@ -503,7 +503,7 @@ class Station:
             sending.cancel()
             await asyncio.gather(sending, return_exceptions=True)
             await browser.close()
-            self._remarks.add(peer, f"browser {name} is gone", logging.INFO)
+            self._remarks.add(peer, f"browser {name} disconnected", logging.INFO)
         return socket
 
 
@@ -603,7 +603,7 @@ class _Browser:
     def _ask_robot(self, command: commands.Asked) -> None:
         """Execute a command that needs a robot."""
         if self._pilot is None:
-            raise self._answered(command, InputError("no robot is looked at"))
+            raise self._answered(command, InputError("no robot is selected"))
         if isinstance(command, Calibrate):
             self._begin(self._calibrate(command))
         else:
@@ -613,7 +613,7 @@ class _Browser:
         value: dict[str, Any] = {}
         try:
             if self._calibration is None:
-                raise InputError("this station calibrates no robot")
+                raise InputError("this station does not calibrate robots")
             match command.order:
                 case "list":
                     value = {"wizards": await self._calibration.offer()}
@@ -630,7 +630,7 @@ class _Browser:
 
     def _fetch(self, command: ReplayRecording) -> None:
         if len(self._ending) >= MOST_REPLAYS:
-            raise self._answered(command, InputError("recordings are being fetched already"))
+            raise self._answered(command, InputError("recordings are already being fetched"))
         self._begin(self._replay(command))
 
     def _answered(self, command: commands.AnyCommand | commands.Asked, error: TruckError) -> TruckError:
@@ -644,7 +644,7 @@ class _Browser:
         if not self.user.may(needed := commands.needed(command)):
             return NotPermittedError(f"user {self.user.name!r} is {self.user.role.value}: expected {needed.value}")
         if isinstance(self._feed, ReplayFeed) and not _while_replaying(command):
-            return NotPermittedError("a recording is shown: nothing but a stop goes to the robot")
+            return NotPermittedError("a recording is shown: only a stop is sent to the robot")
         return None
 
     def _begin(self, job: Coroutine[Any, Any, None]) -> None:
@@ -656,7 +656,7 @@ class _Browser:
         feed = self._feed
         try:
             if not isinstance(feed, RobotFeed):
-                raise InputError("no robot is looked at")
+                raise InputError("no robot is selected")
             name = await self._station.replay(feed.address, command.name, self.user.name, self.viewer, command.stamp)
         except TruckError as error:
             self.viewer.send(frames.refusal(command.id, error))

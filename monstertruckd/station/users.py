@@ -92,7 +92,7 @@ class StationUsers:
             rows = await in_thread(lambda: _read(self._file))
         except (TruckError, OSError) as error:
             if version != self._reported:
-                log.error("the users stay as they were: %s", error)
+                log.error("the user list is unchanged: %s", error)
             self._reported = version
             return False
         self._version = self._reported = version
@@ -177,9 +177,11 @@ def _read(file: Path) -> dict[str, tuple[AccessRole, str]]:
         InputError: the file is not a users file.
     """
     if not file.is_file():
-        raise NotFoundError(f"{file}: not there; expected users (monstertruckd station --add-user NAME --users {file})")
+        raise NotFoundError(
+            f"{file}: does not exist; add a user with monstertruckd station --add-user NAME --users {file}"
+        )
     if file.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO):
-        raise NotPermittedError(f"{file}: others may read it; expected mode 600 (chmod 600 {file})")
+        raise NotPermittedError(f"{file}: other users may read it; expected mode 600 (chmod 600 {file})")
     if not (rows := _rows(file)):
         raise InputError(f"{file}: expected at least one user")
     return {name: _row(file, name, value) for name, value in rows.items()}

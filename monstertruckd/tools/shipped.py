@@ -46,7 +46,7 @@ def configuration(given: Path) -> Path:
     known = list(names())
     near = difflib.get_close_matches(str(given), known, n=1)
     expected = f"did you mean {near[0]!r}?" if near else f"expected a file or one of {', '.join(known)}"
-    raise ConfigError(f"{given}: no file and no bundled configuration; {expected}")
+    raise ConfigError(f"{given}: neither a file nor a bundled configuration; {expected}")
 
 
 def names() -> Iterator[str]:

@@ -11,13 +11,13 @@ ODOMETRY: Final = Catalog(
         name="reckoning",
         settings="monstertruck_estimation.odometry:OdometryConfig",
         implementation="monstertruck_estimation.odometry:build_reckoning",
-        doc="Wheels along the steered arc, the heading held by the compass",
+        doc="Wheels along the steered arc, with the heading corrected by the compass",
     ),
     Plugin(
         name="encoders",
         settings="monstertruck_estimation.rear_wheels:RearWheelConfig",
         implementation="monstertruck_estimation.rear_wheels:build_rear_wheels",
-        doc="Encoders of a tricycle's rear wheels, judged by the driven wheel",
+        doc="Encoders of a tricycle's rear wheels, checked against the driven wheel",
     ),
     Plugin(
         name="fusion",

@@ -35,7 +35,10 @@ class ContraryTurn:
     @property
     def text(self) -> str:
         """Text for the log."""
-        return f"the compass turned {self.headings:+.2f} rad while the robot turned {self.robot:+.2f}: a wrong sign?"
+        return (
+            f"the compass turned {self.headings:+.2f} rad while the robot turned {self.robot:+.2f}: check the "
+            "compass's sign"
+        )
 
 
 class HeadingTurns:

@@ -124,9 +124,9 @@ class InertialInput:
             return
         self._trusted, off = gyro.trusted, round(gyro.difference, 3)
         if gyro.trusted:
-            self._events(Reason.IMU_AGREES, Severity.INFO, self._source, "the IMU counts again", difference=off)
+            self._events(Reason.IMU_AGREES, Severity.INFO, self._source, "the IMU is used again", difference=off)
         else:
-            text = f"the IMU turned {off:+.2f} rad more than the wheels: the heading goes by the wheels"
+            text = f"the IMU turned {off:+.2f} rad more than the wheels: the heading follows the wheels"
             self._events(Reason.IMU_DISAGREES, Severity.WARNING, self._source, text, difference=off)
 
 

@@ -267,7 +267,7 @@ class DeadReckoning:
         self._otherwise = self._otherwise + 1 if off is (self.doubt is None) else 0
         if self._otherwise >= config.alignment:
             self._otherwise = 0
-            self.doubt = f"it is {innovation:+.2f} rad off what the wheels say" if off else None
+            self.doubt = f"it deviates by {innovation:+.2f} rad from the wheels" if off else None
         if off:
             self.rejected_headings += 1
             return
@@ -452,7 +452,7 @@ class OdometryService:
         if doubt is None:
             self._events(Reason.HEADING_RETURNED, Severity.INFO, self.name, returned)
         else:
-            text = f"{doubt}; the yaw goes on without it"
+            text = f"{doubt}; the yaw is estimated without it"
             self._events(Reason.HEADING_DISTURBED, Severity.WARNING, self.name, text)
 
     def accepts_compass(self) -> bool:

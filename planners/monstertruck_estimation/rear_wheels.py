@@ -104,11 +104,11 @@ def judged(expected: Pair, counted: Pair, turned: float, least: float, config: E
     if all(right_ones):
         return EncoderVerdict()
     if not any(right_ones) and agree(counted[0], expected[1]) and agree(counted[1], expected[0]):
-        return EncoderVerdict((False, False), text="left and right are exchanged")
+        return EncoderVerdict((False, False), text="left and right encoders are swapped")
     rolled, driven = sum(counted) / 2, sum(expected) / 2
     if agree(rolled, driven) and not any(right_ones):
-        text = f"the robot turns otherwise than it is steered: right less left {counted[1] - counted[0]:+.2f} m"
-        return EncoderVerdict(text=f"{text}, by the steering {expected[1] - expected[0]:+.2f} m")
+        text = f"the robot does not turn as steered: right minus left wheel {counted[1] - counted[0]:+.2f} m"
+        return EncoderVerdict(text=f"{text}, expected from the steering {expected[1] - expected[0]:+.2f} m")
     if abs(counted[1] - counted[0] - turned) <= config.tolerance + config.share * abs(rolled):
         share = rolled / driven if abs(driven) > config.tolerance else math.inf
         # 1.5: share of the driven wheel's distance that both rear wheels cannot exceed
@@ -126,7 +126,11 @@ def judged(expected: Pair, counted: Pair, turned: float, least: float, config: E
 def _fault(want: float, have: float, *, agrees: bool) -> str:
     if abs(have) <= STANDS * abs(want):
         return "is stuck"
-    return "counts the wrong way" if agrees else f"rolls {have:.2f} m where the driven wheel says {want:.2f} m"
+    return (
+        "counts in the wrong direction"
+        if agrees
+        else f"rolls {have:.2f} m, expected from the driven wheel {want:.2f} m"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -423,11 +427,11 @@ class EncoderInput:
             self._events(Reason.WHEEL_GRIP, Severity.INFO, self._source, "rear wheels and driven wheel agree again")
         if wrong:
             left, right = now.trusted
-            carriers = "the drive carries on", f"{SIDES[not left]} and steering carry on", "both still count"
+            carriers = "odometry uses the drive", f"odometry uses {SIDES[not left]} and steering", "odometry uses both"
             text = f"encoders of the rear wheels: {now.text}; {carriers[left + right]}"
             self._events(Reason.ENCODERS_DISAGREE, Severity.WARNING, self._source, text, left=left, right=right)
         elif was_wrong:
-            self._events(Reason.ENCODERS_AGREE, Severity.INFO, self._source, "the encoders count again")
+            self._events(Reason.ENCODERS_AGREE, Severity.INFO, self._source, "the encoders are used again")
 
 
 def build_rear_wheels(config: RearWheelConfig, context: OdometryContext) -> OdometryService:

@@ -147,7 +147,9 @@ class FrameTree:
         child, parent = transform.child, transform.parent
         known = self._by_child.get(child)
         if known is not None and known.parent != parent:
-            raise InputError(f"frame {child!r} hangs on {known.parent!r}: expected no second parent, got {parent!r}")
+            raise InputError(
+                f"frame {child!r} already has the parent {known.parent!r}: expected no second parent, got {parent!r}"
+            )
         if known is None and (child == parent or child in self._ancestors(parent)):
             raise InputError(f"frame {child!r} on {parent!r} closes a loop: expected a tree")
         self._by_child[child] = transform

@@ -144,7 +144,7 @@ class Chassis(ABC):
         """
         vx, vy, wz = twist
         if self.freedom == "parallel":
-            refuse("wz", wz, vx, "expected 0, this body keeps its heading")
+            refuse("wz", wz, vx, "expected 0, because this body keeps its heading")
         elif self.freedom == "front":
             follows = self.bicycle.l_r * wz
             if vy != 0.0:
@@ -193,7 +193,7 @@ class Chassis(ABC):
         contradiction = 0.2  # shaft speeds may be off the motion they agree on best by this share of the fastest
         if off > contradiction * max(map(abs, shaft_speeds)) + 1e-9:  # m/s
             raise KinematicsError(
-                f"the shafts push against each other: {name} is {off:.3g} m/s off the motion they agree on best"
+                f"the shafts work against each other: {name} deviates by {off:.3g} m/s from the best common motion"
             )
         return twist
 
@@ -215,9 +215,13 @@ class Chassis(ABC):
         """Why the body cannot take these axle angles; None if it can."""
         straight = 1e-6  # axle angles this close count as equal, rad
         if self.freedom == "front" and abs(rear) > straight:
-            return f"rear is {rear:.6g}: expected 0, this body has no second steered axle and cannot move sideways"
+            return (
+                f"rear is {rear:.6g}: expected 0, because this body has no second steered axle and cannot move sideways"
+            )
         if self.freedom == "parallel" and abs(front - rear) > straight:
-            return f"front is {front:.6g}, rear is {rear:.6g}: expected equal angles, this body keeps its heading"
+            return (
+                f"front is {front:.6g}, rear is {rear:.6g}: expected equal angles, because this body keeps its heading"
+            )
         return None
 
     def limited(self, front: float, rear: float, limit: float) -> tuple[float, float]:

@@ -141,7 +141,7 @@ class Mechanics:
         require_positive("relaxation", self.relaxation)
         if self.sprung <= 0.0:
             raise KinematicsError(
-                f"mass is {self.mass}: expected more than wheels and axles together, {self.mass - self.sprung:g} kg"
+                f"mass is {self.mass}: expected more than the wheels and axles, {self.mass - self.sprung:g} kg"
             )
 
     @property
@@ -239,11 +239,13 @@ class Description:
     def __post_init__(self) -> None:
         known = {link.name: link for link in self.links}
         if len(known) < len(self.links):
-            raise KinematicsError(f"description {self.name}: a link's name is used twice")
+            raise KinematicsError(f"description {self.name}: two links have the same name")
         reached = {self.links[0].name}
         for joint in self.joints:
             if joint.parent not in reached or joint.child not in known or joint.child in reached:
-                raise KinematicsError(f"joint {joint.name}: expected a parent before it and a child of its own")
+                raise KinematicsError(
+                    f"joint {joint.name}: expected a parent defined before it and a child without another parent"
+                )
             reached.add(joint.child)
         if reached != set(known):
             raise KinematicsError(

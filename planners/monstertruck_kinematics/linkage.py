@@ -60,7 +60,9 @@ class SteeringLinkage:
         if self.arms not in ("forward", "rearward"):
             raise KinematicsError(f"arms is {self.arms!r}: expected forward or rearward")
         if self.tie_rod <= 0.0:
-            raise KinematicsError(f"king_pins is {self.king_pins}: expected more than 2 d sin(beta), the arms overlap")
+            raise KinematicsError(
+                f"king_pins is {self.king_pins}: expected more than 2 d sin(beta), because the arms overlap"
+            )
 
     @property
     def tie_rod(self) -> float:

@@ -63,7 +63,9 @@ class AxlePolynomials:
         left = polynomial(self.left_from_servo, servo)
         axle = self.axle_from_left(left)
         if not (np.diff(left) > 0.0).all() or not (np.diff(axle) > 0.0).all():
-            raise KinematicsError("left_from_servo, right_from_left: expected angles that grow with the servo angle")
+            raise KinematicsError(
+                "left_from_servo, right_from_left: expected angles that increase with the servo angle"
+            )
         object.__setattr__(self, "axle_limits", (float(axle[0]), float(axle[-1])))
 
     def left_of(self, servo: Real) -> Real:

@@ -53,7 +53,7 @@ class CubicRamp:
             KinematicsError: speed and distance are not of one sign.
         """
         if not v0 * distance > 0.0:
-            raise KinematicsError(f"distance is {distance}: expected one in the direction of the speed, {v0}")
+            raise KinematicsError(f"distance is {distance}: expected the sign of the speed, {v0}")
         # a0 T^2/12 + v0 T/2 - distance = 0, its first positive root
         root = v0 * v0 / 4.0 + a0 * distance / 3.0
         half = v0 / 2.0 + math.copysign(math.sqrt(max(root, 0.0)), v0)

@@ -321,7 +321,7 @@ def least_squares_motion(geometry: FourWheelSteering, angles: tuple[Real, Real, 
         bs, ks = bs + side * drive, ks + turn * drive
     determinant = bb * kk - bk * bk
     if not all_positive(determinant - 1e-12 * (bb * geometry.wheelbase) ** 2):
-        raise KinematicsError("angles: all wheels roll towards one point, the turning rate is undetermined")
+        raise KinematicsError("angles: all wheels roll towards one point, so the yaw rate is undetermined")
     return (bs * kk - ks * bk) / determinant, (bb * ks - bk * bs) / determinant
 
 

@@ -169,7 +169,7 @@ class SwedishDrive:
         size = max(math.hypot(w.x, w.y) for w in self.swedish) or 1.0
         if np.linalg.matrix_rank(matrix / [1.0, 1.0, size], tol=1e-9 * float(np.abs(matrix).max())) < 3:
             names = ", ".join(w.name for w in self.swedish)
-            raise KinematicsError(f"wheels {names}: together they do not drive all of vx, vy and wz")
+            raise KinematicsError(f"wheels {names}: together they cannot produce all of vx, vy and wz")
         object.__setattr__(self, "rates_of_twist", matrix)
         object.__setattr__(self, "twist_of_rates", np.linalg.pinv(matrix))
 

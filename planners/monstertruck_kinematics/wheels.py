@@ -122,7 +122,9 @@ class SwedishWheel(Wheel):
         super().__post_init__()
         require_finite(f"wheel {self.name}: roller", self.roller)
         if abs(math.cos(self.roller)) < 1e-9:
-            raise KinematicsError(f"wheel {self.name}: roller is {self.roller}: at +-pi/2 the wheel drives nothing")
+            raise KinematicsError(
+                f"wheel {self.name}: roller is {self.roller}: a wheel with rollers at +-pi/2 cannot drive"
+            )
 
     @property
     def rolling_row(self) -> Array:
@@ -151,7 +153,7 @@ def checked(wheels: Sequence[Wheel]) -> tuple[Wheel, ...]:
     names = [wheel.name for wheel in wheels]
     for name in names:
         if names.count(name) > 1:
-            raise KinematicsError(f"wheel {name}: two wheels have this name")
+            raise KinematicsError(f"wheel {name}: two wheels have the same name")
     return tuple(wheels)
 
 

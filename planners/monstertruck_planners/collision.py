@@ -52,8 +52,8 @@ class Footprint:
     def __post_init__(self) -> None:
         if not (self.length > 0 and self.width > 0 and self.padding >= 0):
             msg = (
-                f"footprint {self.length} x {self.width} m, padding {self.padding} m: "
-                "expected length and width above 0 and padding not below 0"
+                f"footprint {self.length} x {self.width} m, padding {self.padding} m: expected length and "
+                "width above 0 and padding of at least 0"
             )
             raise InputError(msg)
 

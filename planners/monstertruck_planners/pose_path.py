@@ -41,9 +41,7 @@ class PosePath:
         if not np.isfinite(poses).all() or not (np.abs(directions) == 1.0).all():
             raise InputError("path of poses: expected finite poses and directions of +1 or -1")
         if len(self.steering) not in (0, len(poses)):
-            raise InputError(
-                f"path of {len(poses)} poses, {len(self.steering)} ways of steering: expected one for each"
-            )
+            raise InputError(f"path of {len(poses)} poses, {len(self.steering)} steering modes: expected one for each")
         object.__setattr__(self, "poses", poses)
         object.__setattr__(self, "directions", directions)
 

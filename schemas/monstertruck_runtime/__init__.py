@@ -1,1 +1,1 @@
-"""What every room needs: clock, services, errors, wire codec, client."""
+"""Common base of all packages: clock, services, errors, wire codec, client."""

@@ -1,4 +1,4 @@
-"""The robot's bodies by ``kind``, for daemon and simulated world."""
+"""Robot bodies by ``kind``, for the daemon and the simulated world."""
 
 from typing import Annotated, Any, Final
 
@@ -54,7 +54,7 @@ BODIES: Final = Catalog(
         name="synchro",
         settings="monstertruck_schemas.body:SynchroBody",
         implementation="monstertruck_kinematics.chassis:synchro_chassis",
-        doc="Wheels that roll and turn together",
+        doc="Wheels that all roll and steer together",
     ),
     Plugin(
         name="omni",
@@ -70,22 +70,22 @@ BODIES: Final = Catalog(
     ),
     base=BodyConfig,
 )
-"""A body is a function that makes a ``Chassis`` from its ``Dimensions`` and, by name, the settings of its kind."""
+"""Catalog of bodies: functions that create a ``Chassis`` from its ``Dimensions`` and the settings of its kind."""
 
 AnyBody = Annotated[BodyConfig, BODIES.section()]
-"""The configuration's section `body`."""
+"""Section `body` of the configuration."""
 
 
 def build_chassis(body: BodyConfig, dimensions: Any) -> Any:
-    """The ``Chassis`` of a body.
+    """Create the ``Chassis`` of a body.
 
     Args:
-        body: the configured one.
+        body: configured body.
         dimensions: ``monstertruck_kinematics.chassis.Dimensions``.
 
     Raises:
         InputError: the body does not load.
-        ValueError: dimensions no robot can have, such as a ``KinematicsError`` of ours.
+        ValueError: impossible dimensions, such as a ``KinematicsError``.
     """
     try:
         return BODIES.build(body, dimensions, **body.model_dump(exclude={"kind"}))

@@ -73,14 +73,16 @@ M = TypeVar("M", bound=Message)
 
 
 ORDER_TIMEOUT: Final = 6.0
-"""Seconds to wait for the outcome of an order: the robot itself gives up after 5 s."""
+"""Timeout for the outcome of an order (s): the robot itself gives up after 5 s."""
 
 
 def in_network_thread(take: Callable[[zenoh.Sample], object]) -> "handlers.Callback[zenoh.Sample]":
-    """Handler that calls ``take`` in the thread that reads the network; zenoh-python's own way is one thread further.
+    """Handler that calls ``take`` in the thread that reads the network.
 
-    While it runs nothing else is read from that link: it must be quick, and must not use the session. The interpreter's
-    state of that thread is kept; made again for every message, it costs more than the way to another thread.
+    Zenoh-python's default uses an additional thread.
+
+    During the call no other data is read from that link, so ``take`` must be fast and must not use the session. The
+    thread's interpreter state is kept: creating it for every message costs more than switching threads.
     """
     kept = threading.local()
 
@@ -101,7 +103,7 @@ class Watched(Generic[M]):
 
     Args:
         topic: row of the topic table.
-        declare: subscribes with a handler of samples.
+        declare: subscribes with a handler for samples.
     """
 
     def __init__(self, topic: Topic[M], declare: Callable[..., Any]) -> None:
@@ -115,7 +117,7 @@ class Watched(Generic[M]):
 
     @property
     def latest(self) -> M | None:
-        """Latest message; None before the first, and if it cannot be decoded."""
+        """Latest message; None before the first one, or if it cannot be decoded."""
         data = self._bytes
         if data is not self._decoded[0] and data is not None:
             try:
@@ -135,22 +137,22 @@ class Watched(Generic[M]):
 class TruckClient(Operator):
     """Session with one robot; an async context manager.
 
-    It never listens: it connects to one endpoint, and reconnects when the robot restarts.
-    Messages that cannot be decoded are logged and skipped.
+    It never listens: it connects to one endpoint, and reconnects when the robot restarts. Messages that cannot be
+    decoded are logged and skipped.
 
     Args:
-        robot: name in the keys ``mt/<robot>/...``; None = ``truck``.
-        endpoint: where the robot listens, e.g. ``tcp/192.168.1.7:7447``; None = port 7447 of this computer, where only
-            one robot of this computer could be meant.
-        source: this program's name in requests; default ``user@host:pid``. With a certificate it is the common name,
-            or that with a colon and anything behind it, which is the default: requests under other names never arrive.
+        robot: name in the keys ``mt/<robot>/...``; None: ``truck``.
+        endpoint: address of the robot, e.g. ``tcp/192.168.1.7:7447``; None: port 7447 of this computer, if it is
+            unambiguous.
+        source: this program's name in requests; default ``user@host:pid``. With a certificate it is the common name, by
+            default followed by a colon and a suffix: Zenoh drops requests under other names.
         role: role of its requests; decides their priority.
-        clock: time of stamps and deadlines; robots do not trust it.
-        timeout: seconds to wait for the link and for answers.
+        clock: clock for stamps and deadlines; robots do not trust it.
+        timeout: timeout for the link and for answers, s.
         tls: certificate files for ``tls/...`` endpoints; None for the files of ``station_tls``.
 
     Raises:
-        InputError: the source cannot be part of a key.
+        InputError: the source contains characters not allowed in a key.
     """
 
     def __init__(
@@ -170,7 +172,7 @@ class TruckClient(Operator):
         self._named = source is not None
         self.source = source or own_source()
         if not SOURCE_NAME.fullmatch(self.source):
-            raise InputError(f"source {self.source!r}: expected letters, digits and . _ : - @, but no @ first")
+            raise InputError(f"source {self.source!r}: expected letters, digits and . _ : - @, not starting with @")
         self.role = role
         self._clock = clock or WallClock()
         self._timeout = timeout
@@ -179,20 +181,20 @@ class TruckClient(Operator):
         self._subscriptions: dict[Mailbox[Any], Callable[[], None]] = {}
         self._gate: Mailbox[GateState] | None = None
         self._asking = asyncio.Lock()
-        # Must also grow from one run of this program to the next.
+        # Must also increase from one run of this program to the next.
         self._seq = (self._clock.now() + self._clock.real_offset()) // 1000
         self._instance = secrets.token_hex(8)
         self._overtaking = 0
-        """Stops and emergency stops ordered so far."""
+        """Number of stops and emergency stops ordered so far."""
 
     async def __aenter__(self) -> Self:
         """Connect to the endpoint.
 
         Raises:
-            InputError: no endpoint is given, and several robots run on this computer; lists them.
-            NotFoundError: nothing answers there, or a file of the certificate is missing.
-            NotPermittedError: others may read the certificate's key, the source differs from the certificate's name, or
-                a certificate is refused.
+            InputError: no endpoint is given and several robots run on this computer; the message lists them.
+            NotFoundError: no robot answers at the endpoint, or a file of the certificate is missing.
+            NotPermittedError: other users may read the certificate's key, the source differs from the certificate's
+                name, or a certificate is rejected.
         """
         try:
             await in_thread(self._open)
@@ -232,7 +234,7 @@ class TruckClient(Operator):
         return mailbox
 
     def tap(self, topic: Topic[Any], take: Callable[[bytes], object]) -> Any:
-        """Hand the bytes of every message of ``topic`` to ``take``, in a thread that reads the network.
+        """Pass the bytes of every message of ``topic`` to ``take``, in a thread that reads the network.
 
         A retained topic delivers its latest message at once. ``undeclare()`` of the returned object ends it.
         """
@@ -246,18 +248,18 @@ class TruckClient(Operator):
         return ext.declare_advanced_subscriber(self._open_session(), key, receive, history=history)
 
     def watch(self, topic: Topic[M]) -> "Watched[M]":
-        """Follow the latest message of ``topic``, which is decoded only when it is requested.
+        """Follow the latest message of ``topic``, decoded only on request.
 
-        For looking at a topic less often than it is published: messages in between cost next to nothing.
+        For reading a topic less often than it is published: skipped messages cost almost nothing.
         """
         return Watched(topic, partial(self._open_session().declare_subscriber, topic.key(self.robot)))
 
     async def get_retained(self, topic: Topic[M]) -> M | None:
-        """Latest message of a retained topic; None if the robot has published none yet.
+        """Return the latest message of a retained topic; None if the robot has not published one yet.
 
         Raises:
             NoAnswerError: no answer in time.
-            NotFoundError: the robot is not there.
+            NotFoundError: no such robot.
         """
         for reply in await self._get(topic.key(self.robot)):
             return wire.decode(topic, _payload(reply))
@@ -266,11 +268,11 @@ class TruckClient(Operator):
         raise await self._absent()
 
     async def alive(self) -> bool:
-        """Whether the robot's daemon serves at this moment."""
+        """Whether the robot's daemon is running."""
         return bool(await self._seen(self.robot, self._timeout))
 
     async def _seen(self, name: str, timeout: float) -> list[str]:
-        """Names of the robots that serve at this moment; of one, or of all by ``*``."""
+        """Names of the running robots: one name, or all with ``*``."""
         replies = await self._collect(
             lambda handler: self._open_session().liveliness().get(alive_key(name), handler, timeout=timeout)
         )
@@ -281,18 +283,18 @@ class TruckClient(Operator):
     async def call(
         self, rpc: str, payload: dict[str, Any] | None = None, timeout: float | None = None
     ) -> dict[str, Any]:
-        """Call ``rpc`` on the robot with a JSON object; returns its answer.
+        """Call ``rpc`` on the robot with a JSON object; return its answer.
 
         Args:
-            rpc: name.
+            rpc: name of the call.
             payload: JSON object.
-            timeout: seconds to wait; None for the client's timeout.
+            timeout: timeout, s; None: the client's timeout.
 
         Raises:
-            NotFoundError: no such robot or rpc.
-            InputError: the payload was refused.
-            NoAnswerError: no answer in time, or none although the robot is there.
-            RequestRefusedError: refused; carries the reason.
+            NotFoundError: no such robot or call.
+            InputError: the robot rejected the payload.
+            NoAnswerError: no answer in time, although the robot may be running.
+            RequestRefusedError: the robot refused; carries the reason.
         """
         answer: dict[str, Any] = json.loads(await self._call(rpc, payload or {}, timeout))
         return answer
@@ -310,11 +312,11 @@ class TruckClient(Operator):
     ) -> None:
         """Request a speed (m/s) and axle angles (rad, left positive) for ``lease`` seconds.
 
-        It goes by topic, for speed; whether it is granted shows in ``state/gate`` (holder, last_seq) and in events.
-        ``unseen`` confirms that an operator drives into ground that no sensor has seen, slowly.
+        Sent by topic, for speed; ``state/gate`` (holder, last_seq) and events show whether it is granted. ``unseen``
+        confirms that an operator drives slowly into ground that no sensor has seen.
 
         Raises:
-            NoAnswerError: the robot's nonce did not come in time.
+            NoAnswerError: the robot's nonce was not received in time.
         """
         header = await self.header(lease)
         self._put(REQ_DRIVE, DriveRequest(**header, speed=speed, front=front, rear=rear, unseen=unseen))
@@ -322,43 +324,43 @@ class TruckClient(Operator):
     async def drive_twist(
         self, vx: float, vy: float = 0.0, wz: float = 0.0, lease: float = 0.3, *, unseen: bool = False
     ) -> None:
-        """Request a velocity of the base, forward, to the left (m/s) and turning (rad/s), for ``lease`` seconds.
+        """Request a velocity of the base (forward and left in m/s, yaw rate in rad/s) for ``lease`` seconds.
 
-        The robot refuses a motion that its body cannot execute, with an event ``impossible_motion``. ``unseen`` as in
-        ``drive``, which raises the same.
+        The robot refuses a motion that its body cannot make, with an event ``impossible_motion``. ``unseen`` and errors
+        as in ``drive``.
         """
         header = await self.header(lease)
         twist = RequestedTwist(vx=vx, vy=vy, wz=wz)
         self._put(REQ_DRIVE, DriveRequest(**header, speed=0.0, front=0.0, twist=twist, unseen=unseen))
 
     async def drive_shafts(self, *rates: float, lease: float = 0.3) -> None:
-        """Request the rate of the wheels on every driven shaft, rad/s, for ``lease`` seconds: open loop, for engineers.
+        """Request the wheel rate of every driven shaft, rad/s, for ``lease`` seconds: open loop, for engineers.
 
-        Limits, ramps and the sweep hold as for every request. Raises as ``drive`` does.
+        Limits, ramps and the sweep apply as for every request. Raises the errors of ``drive``.
         """
         self._put(REQ_DRIVE, DriveRequest(**await self.header(lease), speed=0.0, front=0.0, shafts=rates))
 
     def publish_stand_pose(self, pose: StandPose) -> None:
-        """Say where the robot really is, as a test stand sees it: the robot records it, and nothing in it reads it."""
+        """Publish the robot's true pose measured by a test stand: the robot records it and does not use it."""
         self._open_session().put(
             STAND_POSE.key(self.robot), wire.encode(STAND_POSE, pose), encoding=wire.encoding(STAND_POSE)
         )
 
     def order(self, order: Order, *, hold: bool = False, calibrates: bool = False) -> Coroutine[Any, Any, GateState]:
-        """Give an order; the coroutine waits until it is carried out and returns the gate's state then.
+        """Send an order and wait until it is carried out; return the resulting gate state.
 
-        An emergency stop or stop is published by this call itself, whatever is known of the robot and whether or not
-        its outcome is awaited. Any other order that is still waiting for the robot's nonce then is withdrawn.
+        An emergency stop or stop is published by this call immediately, even without a connection to the robot or if
+        its outcome is not awaited. Any other order that is then still waiting for the robot's nonce is withdrawn.
 
         Args:
-            order: what.
-            hold: of an order to arm: planners do not drive until the truck is armed without it.
-            calibrates: of an order to arm: see ``ControlRequest``.
+            order: order to send.
+            hold: with an order to arm: planners do not drive until the truck is armed without it.
+            calibrates: with an order to arm: see ``ControlRequest``.
 
         Raises:
-            RequestRefusedError: refused, or overtaken by a stop; carries the reason.
-            NoAnswerError: no answer in time, or the robot's nonce did not come in time.
-            NotFoundError: the robot is not there.
+            RequestRefusedError: refused, or superseded by a stop; carries the reason.
+            NoAnswerError: no answer in time, or the robot's nonce was not received in time.
+            NotFoundError: no such robot.
         """
         if order in UNCONDITIONAL:
             self._overtaking += 1
@@ -368,30 +370,36 @@ class TruckClient(Operator):
         return self._outcome(order, self._overtaking, {name: True for name, wanted in flags.items() if wanted})
 
     async def ask_to_drive(self) -> GateState:
-        """Ask the operator who drives to hand over: it shows in ``asking`` of the gate's state. Raises as ``order``."""
+        """Request control from the driving operator; the gate's state lists it in ``asking``.
+
+        Raises the errors of ``order``.
+        """
         return await self._outcome(Order.ASK, self._overtaking, {})
 
     async def hand_over(self, to: str) -> GateState:
-        """Let another operator drive, who has requested it; only who drives can. Raises as ``order`` does."""
+        """Hand over to an operator who has requested control; only the driving operator can.
+
+        Raises the errors of ``order``.
+        """
         return await self._outcome(Order.HAND_OVER, self._overtaking, {"to": to})
 
     async def _outcome(self, order: Order, overtaking: int, more: dict[str, Any]) -> GateState:
         header = self._header(1.0) if order in UNCONDITIONAL else await self.header()
         if overtaking != self._overtaking and order not in UNCONDITIONAL:
-            raise RequestRefusedError(Reason.BAD_SEQUENCE, f"{order.value}: overtaken by a stop")
+            raise RequestRefusedError(Reason.BAD_SEQUENCE, f"{order.value}: superseded by a stop")
         return wire.decode(GATE, await self._call(order.value, header | more, ORDER_TIMEOUT))
 
     async def goal(
         self, goal: tuple[float, float, float], frame: str = "map", via: Sequence[tuple[float, ...]] = ()
     ) -> dict[str, Any]:
-        """Request to drive to x, y (m), yaw (rad), and wait for the first route; returns the goal's ``number``.
+        """Request to drive to x, y (m), yaw (rad), and wait for the first route; return the goal's ``number``.
 
-        ``via`` are waypoints, x, y and optionally yaw. Progress is published on ``plan/goal``. Numbers that are not
-        finite reach the robot, which refuses them by name.
+        ``via`` are waypoints: x, y and optionally yaw. ``plan/goal`` publishes the progress. Numbers that are not
+        finite are sent to the robot, which refuses them by name.
 
         Raises:
-            RequestRefusedError: no route to the goal, or why the robot does not drive.
-            NotFoundError: the robot is not there, or has no planner.
+            RequestRefusedError: no route to the goal, or the robot does not drive; carries the reason.
+            NotFoundError: no such robot, or it has no planner.
             NoAnswerError: no answer in time.
         """
         x, y, yaw = goal
@@ -406,7 +414,7 @@ class TruckClient(Operator):
         )
 
     async def goal_control(self, order: GoalOrder, *, own: bool = False) -> None:
-        """Pause, resume or cancel the goal; ``own``: only one that this client sent. Raises as ``goal`` does."""
+        """Pause, resume or cancel the goal; ``own``: only a goal of this client. Raises the errors of ``goal``."""
         await self.call("goal_control", {**await self.header(), "order": order, "own": own})
 
     async def explore(
@@ -418,18 +426,18 @@ class TruckClient(Operator):
         find: int | None = None,
         own: bool = False,
     ) -> dict[str, Any]:
-        """Start an exploration, or end it; answers with its ``number``. Progress is on ``plan/explore``.
+        """Start or end an exploration; return its ``number``. ``plan/explore`` publishes the progress.
 
         Args:
-            order: which of both.
-            home: drive back to the start at the end; None for the configured value.
-            budget: time limit, s; None for the configured value.
-            find: look for tags on walls, too, and end when so many are known.
-            own: with a stop: only one that this client started.
+            order: start or stop.
+            home: drive back to the start at the end; None: as configured.
+            budget: time limit, s; None: as configured.
+            find: also search for tags on walls, and end when this many are known.
+            own: with a stop: only an exploration started by this client.
 
         Raises:
-            RequestRefusedError: why it does not start, or none runs.
-            NotFoundError: the robot is not there, or does not explore.
+            RequestRefusedError: it does not start, or none is running; carries the reason.
+            NotFoundError: no such robot, or it does not explore.
             NoAnswerError: no answer in time.
         """
         request = {"order": order, "home": home, "budget": budget, "own": own}
@@ -443,20 +451,20 @@ class TruckClient(Operator):
         place: tuple[float, float] | None = None,
         yaw: float | None = None,
     ) -> dict[str, Any]:
-        """Mark a place by name, or have a point of interest forgotten; all are on ``state/points``.
+        """Mark a place by name, or remove a point of interest; ``state/points`` lists all.
 
         Args:
-            order: which of both.
+            order: mark or remove.
             name: name of the point.
-            place: place of a mark, in map, m; None = where the robot is.
-            yaw: rad; None for the robot's yaw.
+            place: position of a mark in map, m; None: the robot's.
+            yaw: yaw of a mark, rad; None: the robot's.
 
         Returns:
-            Of a mark its place: ``x``, ``y`` (m) and ``yaw`` (rad) in map.
+            Pose of a mark: ``x``, ``y`` (m) and ``yaw`` (rad) in map.
 
         Raises:
-            RequestRefusedError: why not.
-            NotFoundError: the robot, or the point, is not there, or the robot keeps none.
+            RequestRefusedError: refused; carries the reason.
+            NotFoundError: no such robot or point, or the robot keeps no points.
             NoAnswerError: no answer in time.
         """
         x, y = (None, None) if place is None else place
@@ -467,18 +475,18 @@ class TruckClient(Operator):
     async def zone(
         self, order: ZoneOrder, name: str, area: ZoneArea | None = None, seconds: float = OFF_FOR
     ) -> dict[str, Any]:
-        """Add or remove a zone, or turn one on, or off for a while; all are on ``state/zones``.
+        """Add or remove a zone, or turn it on, or off for a while; ``state/zones`` lists all.
 
         Args:
-            order: what.
+            order: what to do with the zone.
             name: name of the zone.
             area: polygon of a new zone.
-            seconds: how long it is off (s).
+            seconds: duration for which it is off, s.
 
         Raises:
-            RequestRefusedError: why not.
-            NotFoundError: the robot, or the zone, is not there, or the robot keeps none.
-            InputError: the zone is one of the configuration's.
+            RequestRefusedError: refused; carries the reason.
+            NotFoundError: no such robot or zone, or the robot keeps no zones.
+            InputError: the zone is defined in the configuration.
             NoAnswerError: no answer in time.
         """
         polygon = None if area is None else area.model_dump(mode="json")
@@ -489,17 +497,17 @@ class TruckClient(Operator):
     async def mission(
         self, order: MissionOrder, mission: Mission | None = None, *, moved: bool = False, own: bool = False
     ) -> dict[str, Any]:
-        """Start a mission, resume one, or end it; answers with its ``number``. Progress is on ``plan/mission``.
+        """Start, resume or end a mission; return its ``number``. ``plan/mission`` publishes the progress.
 
         Args:
-            order: what.
-            mission: to be started.
-            moved: resume it although the robot is not where it was interrupted.
-            own: of a stop: only one that this client started, or resumed.
+            order: start, resume or stop.
+            mission: mission to start.
+            moved: resume it even if the robot is not where it was interrupted.
+            own: with a stop: only a mission started or resumed by this client.
 
         Raises:
-            RequestRefusedError: why it does not start, or none runs.
-            NotFoundError: the robot is not there, or does no missions.
+            RequestRefusedError: it does not start, or none is running; carries the reason.
+            NotFoundError: no such robot, or it does not support missions.
             NoAnswerError: no answer in time.
         """
         steps = None if mission is None else mission.model_dump(mode="json")
@@ -507,36 +515,38 @@ class TruckClient(Operator):
         return await self.call("mission", {**await self.header(), **wanted})
 
     async def start_path(self, name: str) -> str:
-        """Have the armed robot drive the path of its configuration once; returns the name under which it is followed.
+        """Let the armed robot drive the configured path once; return the name under which the tracker follows it.
 
         Raises:
-            RequestRefusedError: why it does not start.
-            NotFoundError: the robot is not there, or has no such path.
+            RequestRefusedError: it does not start; carries the reason.
+            NotFoundError: no such robot or path.
             NoAnswerError: no answer in time.
         """
         return str((await self.call("start_path", {**await self.header(), "path": name}))["path"])
 
     async def path(self, path: DrivePath, lease: float = 1.0) -> None:
-        """Request to follow a path computed here. Raises as ``drive`` does."""
+        """Request to follow a path computed by this client. Raises the errors of ``drive``."""
         self._put(REQ_PATH, PathRequest(**await self.header(lease), frame=path.frame, path=path))
 
     async def localise(self, map_from_odom: tuple[float, float, float], lease: float = 1.0) -> None:
-        """Tell a robot with ``slam.mode: ros2`` the pose of odom in map (m, m, rad); it stands for ``lease`` seconds.
+        """Send the pose of odom in map (m, m, rad) to a robot with ``slam.mode: ros2``.
 
-        Raises as ``drive`` does.
+        It is valid for ``lease`` seconds.
+
+        Raises the errors of ``drive``.
         """
         x, y, yaw = map_from_odom
         correction = Pose2D(x=x, y=y, yaw=yaw)
         self._put(REQ_LOCALISATION, LocalisationRequest(**await self.header(lease), correction=correction))
 
     async def send_map(self, packed: bytes, size: tuple[int, int], resolution: float, origin: Pose2D) -> None:
-        """Send a map to a robot with ``slam.mode: ros2``. Raises as ``drive`` does.
+        """Send a map to a robot with ``slam.mode: ros2``. Raises the errors of ``drive``.
 
         Args:
-            packed: see ``MapRequest.packed``.
+            packed: compressed cells, see ``MapRequest.packed``.
             size: width and height in cells.
             resolution: m.
-            origin: origin of the corner of the first cell in map.
+            origin: pose of the corner of the first cell in map.
         """
         width, height = size
         request = MapRequest(
@@ -546,7 +556,7 @@ class TruckClient(Operator):
 
     def _put(self, topic: Topic[M], message: M, key: Callable[[str, str], str] | None = None) -> None:
         assert topic.writer is Writer.OUTSIDE
-        # Requests overtake everything else on the link, and an order is never dropped for lack of room.
+        # Requests precede all other data on the link, and an order is never dropped for lack of space.
         driving = topic.name == REQ_DRIVE.name
         self._open_session().put(
             (key or topic.key)(self.robot, self.source),
@@ -558,12 +568,12 @@ class TruckClient(Operator):
         )
 
     async def ready(self) -> None:
-        """Wait until the robot's nonce is known: until then requests wait and age.
+        """Wait until the robot's nonce is known: until then a request would only wait and age.
 
         Raises:
-            NoAnswerError: it did not come in time.
+            NoAnswerError: it was not received in time.
         """
-        async with self._asking:  # one task at a time waits for it
+        async with self._asking:  # only one task at a time waits for it
             gate = self._followed_gate()
             if gate.latest is None:
                 try:
@@ -574,7 +584,7 @@ class TruckClient(Operator):
                     raise NoAnswerError(msg) from None
 
     async def header(self, lease: float = 1.0) -> dict[str, Any]:
-        """Header of a request once the robot's nonce is known; raises as ``ready`` does."""
+        """Header of a request, once the robot's nonce is known; raises the errors of ``ready``."""
         await self.ready()
         return self._header(lease)
 
@@ -606,7 +616,9 @@ class TruckClient(Operator):
     async def _close(self) -> None:
         session, self._session = self._session, None
         if session is not None:
-            await in_daemon_thread(session.close)  # also at the program's end, when pools take nothing any more
+            await in_daemon_thread(
+                session.close
+            )  # also at the end of the program, when thread pools accept no more work
 
     def _open(self) -> None:
         if self._choose is not None:
@@ -620,7 +632,7 @@ class TruckClient(Operator):
             self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
         except zenoh.ZError as error:
             require_certificates(self.endpoint, tls)
-            waited = (self._clock.now() - began) / SECOND  # longer than ``timeout`` where the computer is busy
+            waited = (self._clock.now() - began) / SECOND  # longer than ``timeout`` if the computer is busy
             msg = f"no robot answers at {self.endpoint} within {waited:.1f} s: is its daemon running there "
             msg += "(`monstertruckd run`, or `simulate --run`), or is it elsewhere (--endpoint)?"
             raise NotFoundError(msg) from error
@@ -630,8 +642,8 @@ class TruckClient(Operator):
             self.source = own_source(owner)
         elif self.source.partition(":")[0] != owner:
             raise NotPermittedError(
-                f"source {self.source!r}: the certificate is that of {owner!r}; expected this name, or one that begins "
-                f"with {owner}:"
+                f"source {self.source!r}: the certificate is for {owner!r}; expected this name, or one "
+                f"starting with {owner}:"
             )
 
     def _open_session(self) -> zenoh.Session:
@@ -654,7 +666,7 @@ class TruckClient(Operator):
         )
 
     async def _collect(self, ask: Callable[["handlers.Callback[zenoh.Reply]"], object]) -> list[zenoh.Reply]:
-        """All replies of a query, gathered without blocking the loop."""
+        """Collect all replies of a query without blocking the loop."""
         loop = asyncio.get_running_loop()
         done: asyncio.Future[None] = loop.create_future()
         replies: list[zenoh.Reply] = []
@@ -672,15 +684,15 @@ class TruckClient(Operator):
         return replies
 
     async def _absent(self) -> NotFoundError | NoAnswerError:
-        """That the robot is not there, and which ones are; or that it is, and does not answer."""
-        look = 0.5  # seconds that running robots take to answer
-        # One that requires certificates shows itself only to who asks for it by name.
+        """Error for a robot that does not answer: whether it is running, or which other robots are."""
+        look = 0.5  # seconds within which running robots answer
+        # A robot that requires certificates shows itself only to queries for its name.
         seen = await asyncio.gather(self._seen("*", look), self._seen(self.robot, look))
         names = sorted({name for some in seen for name in some})
         if self.robot in names:
-            why = f"it is starting or ending, or takes nothing from {self.source!r}"
+            why = f"it is starting or ending, or does not accept requests of {self.source!r}"
             return NoAnswerError(f"robot {self.robot!r} at {self.endpoint} does not answer: {why}")
-        there = f"; there {'is' if len(names) == 1 else 'are'} {', '.join(names)} (--robot NAME)" if names else ""
+        there = f"; found: {', '.join(names)} (--robot NAME)" if names else ""
         if protocol_of(self.endpoint) == "tls":
             there += f", or it does not know the certificate of {self.source.partition(':')[0]!r} (its `zenoh.tls`)"
         return NotFoundError(f"no robot {self.robot!r} at {self.endpoint}{there}")
@@ -696,7 +708,7 @@ def _deliver(topic: Topic[M], mailbox: Mailbox[M], data: bytes) -> None:
 
 
 def _payload(reply: zenoh.Reply) -> bytes:
-    """Bytes of a good reply.
+    """Bytes of a successful reply.
 
     Raises:
         TruckError: the reply is a refusal.
@@ -708,7 +720,7 @@ def _payload(reply: zenoh.Reply) -> bytes:
 
 
 def _refusal(data: bytes) -> TruckError:
-    """Error from an error reply; Zenoh's own replies are plain text."""
+    """Error of an error reply; Zenoh's own replies are plain text."""
     try:
         fields = json.loads(data)
         reason, text = Reason(fields["reason"]), str(fields["text"])  # type: ignore[call-arg]  # look-up by value

@@ -1,9 +1,9 @@
-"""Time, injected everywhere: wall, virtual and replay clocks, and the event loops that carry them.
+"""Injected time: wall, virtual and replay clocks, and their event loops.
 
 Every coroutine sleeps on its event loop as usual (``asyncio.sleep``, ``asyncio.timeout``); only the loop differs.
-``VirtualLoop`` jumps to the next timer as soon as nothing is ready to run, so an hour of driving takes as long as its
-computations, and two runs of one seed are identical. A replay clock is a virtual loop that starts at the log's first
-stamp and can be held to a multiple of real time. ``Schedule`` is periodic work without drift, on either.
+``VirtualLoop`` jumps to the next timer as soon as no task is ready, so an hour of driving takes only its computing
+time, and two runs with one seed are identical. A replay clock is a virtual loop that starts at the log's first stamp
+and can be limited to a multiple of real time. ``Schedule`` gives periodic work without drift on any loop.
 
 This is the only module that may import ``time``.
 """
@@ -29,7 +29,7 @@ T = TypeVar("T")
 Ts = TypeVarTuple("Ts")
 
 SECOND = 1_000_000_000
-"""Nanoseconds of a second."""
+"""Nanoseconds per second."""
 
 MILLISECOND: Final = SECOND // 1000
 
@@ -38,20 +38,24 @@ MANY_TIMERS: Final = 100
 """Minimum number of timers before cancelled ones are removed."""
 
 GUARD: Final = 300.0
-"""Seconds of processor time, or of waiting for another thread, allowed for a virtual second: compiling kernels takes a
-minute or two."""
+"""Maximum processor time, or wait for another thread, per virtual second (s): compiling kernels takes a minute or
+two.
+"""
 ENDING: Final = 600.0
-"""Virtual seconds that all tasks may take to end once a run is over."""
+"""Virtual seconds within which all tasks must end after a run."""
 
 
 def is_date(real: int) -> bool:
-    """Whether a real time, ns, can be the date of a run."""
-    # 946_684_800 * SECOND: 2000-01-01: earlier dates are from a virtual clock, or a computer whose clock was never set
+    """Whether a real time (ns) can be the date of a run."""
+    # 946_684_800 * SECOND: 2000-01-01: earlier dates come from a virtual clock, or a computer whose clock was never set
     return real >= 946_684_800 * SECOND
 
 
 def minute_of_day(real: int) -> int | None:
-    """Return the local time of day (minutes since midnight) at a real time (ns); None if that can be no date."""
+    """Return the local time of day (minutes since midnight) at a real time (ns).
+
+    None if the time is not a valid date.
+    """
     if not is_date(real):
         return None
     local = time.localtime(real // SECOND)
@@ -59,20 +63,20 @@ def minute_of_day(real: int) -> int | None:
 
 
 def processor_time() -> float:
-    """Processor time of the calling thread (s), independent of the computer's other load."""
+    """Processor time of the calling thread (s), independent of the load of the computer."""
     return time.thread_time()
 
 
 class Clock(ABC):
-    """The clock that services are given; sleeping uses the timers of the running loop."""
+    """Clock passed to services; sleeping uses the timers of the running loop."""
 
     @abstractmethod
     def now(self) -> int:
-        """Nanoseconds of the daemon's monotonic time."""
+        """Daemon time (monotonic), ns."""
 
     @abstractmethod
     def real_offset(self) -> int:
-        """Nanoseconds to add to ``now()`` for real (UNIX) time."""
+        """Offset from ``now()`` to real (UNIX) time, ns."""
 
     async def sleep(self, seconds: float) -> None:
         """Wait at least ``seconds``."""
@@ -86,22 +90,22 @@ class Clock(ABC):
     def deadline(self, seconds: float) -> asyncio.Timeout:
         """Async context manager that raises ``TimeoutError`` inside after ``seconds``.
 
-        On the wall clock it may be 1.5 ms early.
+        On the wall clock it may trigger 1.5 ms early.
         """
         return asyncio.timeout(seconds)
 
 
 class WallClock(Clock):
-    """CLOCK_MONOTONIC and uvloop, whose timers count its whole milliseconds."""
+    """CLOCK_MONOTONIC with uvloop, whose timers have millisecond resolution."""
 
     async def sleep(self, seconds: float) -> None:
         """Wait at least ``seconds``, and one iteration of the event loop."""
         await self.sleep_until(self.now() + round(seconds * SECOND))
 
     async def sleep_until(self, instant: int) -> None:
-        """Wait for the whole millisecond at or after ``instant``; the kernel may add most of a millisecond.
+        """Wait for the full millisecond at or after ``instant``; the kernel may add almost a millisecond.
 
-        If it has passed, waits one iteration of the event loop: a task that never catches up does not stop the others.
+        If it has passed, wait one iteration of the event loop, so that a late task does not starve the others.
         """
         while True:
             await asyncio.sleep(max(-(-instant // MILLISECOND) - self.now() // MILLISECOND, 0) / 1000)
@@ -113,7 +117,7 @@ class WallClock(Clock):
         return time.monotonic_ns()
 
     def real_offset(self) -> int:
-        """Offset of CLOCK_REALTIME, read back to back with CLOCK_MONOTONIC."""
+        """Offset of CLOCK_REALTIME, read immediately after CLOCK_MONOTONIC."""
         before = time.monotonic_ns()
         real = time.time_ns()
         return real - (before + time.monotonic_ns()) // 2
@@ -125,7 +129,8 @@ class HungError(RuntimeError):
 
 ON_COMPUTER: Final[contextvars.ContextVar[bool]] = contextvars.ContextVar("on_computer", default=False)
 """True for tasks on the robot's computer, whose loop can stall while world and devices continue: see
-``VirtualLoop.stall``."""
+``VirtualLoop.stall``.
+"""
 
 
 def on_computer() -> contextvars.Context:
@@ -136,14 +141,14 @@ def on_computer() -> contextvars.Context:
 
 
 class VirtualLoop(asyncio.SelectorEventLoop):
-    """Event loop whose time jumps to the next timer when nothing is ready.
+    """Event loop whose time jumps to the next timer when no task is ready.
 
-    Timers of one instant fire in the order of their creation, so that only the seed decides a run. An
-    exception outside ``Exception`` in a callback, such as a test's time-out, ends the run.
+    Timers of the same instant fire in the order of their creation, so only the seed determines a run. An exception
+    outside ``Exception`` in a callback, such as a test's timeout, ends the run.
 
     Args:
-        start: first instant, ns.
-        rate: greatest speed relative to real time; ``None`` runs as fast as it can.
+        start: initial time, ns.
+        rate: maximum speed relative to real time; None: unlimited.
         guard: see ``GUARD``.
     """
 
@@ -151,12 +156,12 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         self.instant = start
         """Virtual nanoseconds."""
         self.woken = False
-        """Another thread has added a callback."""
+        """Set when another thread has added a callback."""
         self._real_start = time.monotonic_ns()
         self._start = start
         self._rate = rate
         self._timers: list[_Timer] = []
-        """A heap."""
+        """Heap of timers."""
         self._timers_set = 0
         self._most_timers = MANY_TIMERS
         self._held: list[asyncio.Handle] | None = None
@@ -165,7 +170,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         self._turns = 0
         self._guarded_second = -1
         self._used = 0.0
-        """Processor time at the start of the guarded second (s)."""
+        """Processor time at the start of the current virtual second (s)."""
         self._end_by: int | None = None
         super().__init__(_VirtualSelector(self))
 
@@ -176,7 +181,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     def call_at(
         self, when: float, callback: Callable[[*Ts], object], *args: *Ts, context: contextvars.Context | None = None
     ) -> asyncio.TimerHandle:
-        """Schedule as in asyncio; timers of one instant fire in order of creation."""
+        """Schedule as asyncio does; timers of the same instant fire in the order of creation."""
         if len(self._timers) > self._most_timers:
             self._timers = [timer for timer in self._timers if not timer.handle.cancelled()]
             heapq.heapify(self._timers)
@@ -190,30 +195,30 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     def call_soon_threadsafe(
         self, callback: Callable[[*Ts], object], *args: *Ts, context: contextvars.Context | None = None
     ) -> asyncio.Handle:
-        """Schedule as in asyncio; also note that the kernel must be polled."""
+        """Schedule as asyncio does; also note that the kernel must be polled."""
         handle = super().call_soon_threadsafe(callback, *args, context=context)
         self.woken = True
         return handle
 
     def call_exception_handler(self, context: dict[str, Any]) -> None:
-        """Handle as in asyncio, but raise an exception outside ``Exception`` from the running loop."""
+        """Handle as asyncio does, but raise an exception outside ``Exception`` from the running loop."""
         error = context.get("exception")
         if error is not None and not isinstance(error, Exception | asyncio.CancelledError):
             raise error
         super().call_exception_handler(context)
 
     def end_soon(self) -> None:
-        """The run is over: its tasks have ``ENDING`` to end."""
+        """Announce the end of the run: its tasks have ``ENDING`` to end."""
         self._end_by = self.instant + round(ENDING * SECOND)
 
     def watch(self) -> None:
         """Check that virtual time advances; called in every iteration.
 
         Raises:
-            HungError: it does not.
+            HungError: it does not advance.
         """
         self._turns += 1
-        if self._turns % 1024:  # iterations of a virtual loop between two looks at the processor time
+        if self._turns % 1024:  # number of loop iterations between two checks of the processor time
             return
         second, used = self.instant // SECOND, time.process_time()
         if second != self._guarded_second:
@@ -222,10 +227,10 @@ class VirtualLoop(asyncio.SelectorEventLoop):
             raise self._hung(f"virtual second {second} has taken {used - self._used:.0f} s of processor time")
 
     def wait(self, select: Callable[[float], T]) -> T:
-        """Wait for another thread or a file: nothing is ready, and no timer is set.
+        """Wait for another thread or a file: no task is ready and no timer is set.
 
         Raises:
-            HungError: nothing comes.
+            HungError: the wait timed out.
         """
         for _ in range(max(1, round(self._guard))):
             if events := select(min(1.0, self._guard)):
@@ -240,12 +245,12 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         return HungError(f"{what}; {len(tasks)} tasks, see their stacks")
 
     def stall(self, seconds: float) -> None:
-        """Run nothing of the robot's computer for some time, as during a computation; everything else continues.
+        """Suspend the robot's computer for some time, as during a computation; everything else continues.
 
-        Callbacks that come due meanwhile run afterwards, in order. A stall during a stall changes nothing.
+        Callbacks that become due meanwhile run afterwards, in order. A second stall during a stall has no effect.
 
         Args:
-            seconds: from now on.
+            seconds: duration from now.
         """
         if self._held is not None:
             return
@@ -262,7 +267,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     def _call_soon_stalled(
         self, callback: Callable[[*Ts], object], *args: *Ts, context: contextvars.Context | None = None
     ) -> asyncio.Handle:
-        """Run as in asyncio, but callbacks of the robot's computer wait during a stall."""
+        """Run as asyncio does, but hold back callbacks of the robot's computer during a stall."""
         context = contextvars.copy_context() if context is None else context
         if self._held is None or not context.get(ON_COMPUTER, False):
             return super().call_soon(callback, *args, context=context)
@@ -296,7 +301,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
             time.sleep(max(0, due - time.monotonic_ns()) / SECOND)
 
     def fire(self) -> None:
-        """Hand the timers that are due to this iteration of the event loop."""
+        """Pass the due timers to this iteration of the event loop."""
         end = self.time() + 1 / SECOND
         while self._timers and self._timers[0].when < end:
             timer = heapq.heappop(self._timers)
@@ -304,10 +309,10 @@ class VirtualLoop(asyncio.SelectorEventLoop):
 
 
 class _Timer(NamedTuple):
-    """Entry of a loop's heap, by instant and then by number in the order of setting."""
+    """Heap entry of a timer, ordered by time and then by number of creation."""
 
     when: float
-    """Seconds."""
+    """Time, s."""
     number: int
     handle: asyncio.TimerHandle
     callback: Callable[..., object]
@@ -320,10 +325,10 @@ class _Timer(NamedTuple):
 
 
 class _VirtualSelector(selectors.DefaultSelector):
-    """Wait for the kernel, once per iteration of the loop; without limit if nothing is ready and there are no timers.
+    """Poll the kernel, once per loop iteration; without limit if no task is ready and no timer is set.
 
-    The kernel is asked only when another thread has woken the loop, when files other than its wake-up pipe are watched,
-    or when there is no timer to jump to.
+    The kernel is polled only when another thread has woken the loop, when files other than the wake-up pipe are
+    watched, or without a timer to jump to.
     """
 
     def __init__(self, loop: VirtualLoop) -> None:
@@ -332,19 +337,19 @@ class _VirtualSelector(selectors.DefaultSelector):
         self._files = 0
 
     def register(self, fileobj: Any, events: int, data: Any = None) -> selectors.SelectorKey:
-        """Watch one more file."""
+        """Count one more watched file."""
         key = super().register(fileobj, events, data)
         self._files += 1
         return key
 
     def unregister(self, fileobj: Any) -> selectors.SelectorKey:
-        """Watch one file less."""
+        """Count one watched file less."""
         key = super().unregister(fileobj)
         self._files -= 1
         return key
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        """Events of files; without any, an idle loop's time jumps."""
+        """Events of files; without watched files, the time of an idle loop jumps."""
         loop = self._loop
         loop.watch()
         idle, wait = timeout is None, loop.next_timer()
@@ -366,7 +371,7 @@ class _VirtualSelector(selectors.DefaultSelector):
 
 
 class VirtualClock(Clock):
-    """Clock of a ``VirtualLoop``; its real time is fixed but for ``step_real``, so that runs are reproducible."""
+    """Clock of a ``VirtualLoop``; its real time is fixed except for ``step_real``, so that runs are reproducible."""
 
     def __init__(self, loop: VirtualLoop, real_offset: int = 0) -> None:
         self._loop = loop
@@ -377,7 +382,7 @@ class VirtualClock(Clock):
         return self._loop.instant
 
     def real_offset(self) -> int:
-        """The offset given at construction, and the steps since."""
+        """Offset given at construction, plus later steps."""
         return self._real_offset
 
     def spend(self, seconds: float) -> None:
@@ -389,7 +394,7 @@ class VirtualClock(Clock):
         self._loop.stall(seconds)
 
     def step_real(self, seconds: float) -> None:
-        """Set the real time forwards or back, as an operator or a time server does."""
+        """Step the real time forwards or back, as an operator or a time server does."""
         self._real_offset += round(seconds * SECOND)
 
 
@@ -407,9 +412,9 @@ def run_virtual(
     """Run ``main(clock)`` to its end on a new virtual loop.
 
     Args:
-        main: coroutine function that gets the clock.
-        start: first instant, ns.
-        rate: greatest speed relative to real time; ``None`` = unlimited.
+        main: coroutine function that receives the clock.
+        start: initial time, ns.
+        rate: maximum speed relative to real time; None: unlimited.
         guard: see ``GUARD``.
 
     Raises:
@@ -434,10 +439,12 @@ def _run(loop: VirtualLoop, main: Callable[[VirtualLoop], Coroutine[Any, Any, T]
 
 
 def run_wall(main: Callable[[WallClock], Coroutine[Any, Any, T]]) -> T:
-    """Run ``main(clock)`` on uvloop. Ctrl-C cancels it, a second one does not disturb its end, a third one does.
+    """Run ``main(clock)`` on uvloop.
 
-    A second Ctrl-C, or timeout(1), which signals a program and its group, must not interrupt the end of ``main``, which
-    stops the robot.
+    Ctrl-C cancels it, a second one is ignored during its shutdown, a third one interrupts.
+
+    A second Ctrl-C, or timeout(1), which signals a program and its group, must not interrupt the shutdown of ``main``,
+    which stops the robot.
     """
 
     async def work() -> T:
@@ -455,7 +462,7 @@ def run_wall(main: Callable[[WallClock], Coroutine[Any, Any, T]]) -> T:
 
 
 def _ignore_second_interrupt() -> None:
-    """Inside an ``asyncio.Runner``, whose handler cancels at the first interrupt and breaks off at the others."""
+    """Within an ``asyncio.Runner``, whose handler cancels at the first interrupt and aborts at later ones."""
     handler, come = signal.getsignal(signal.SIGINT), itertools.count(1)
 
     def interrupt(number: int, frame: FrameType | None) -> None:
@@ -466,28 +473,28 @@ def _ignore_second_interrupt() -> None:
 
 
 class Lead(IntEnum):
-    """Times by which schedules are ahead of the gate's ticks (ns); negative: behind."""
+    """Time by which schedules precede the gate's ticks (ns); negative: follow them."""
 
     BEFORE_GATE = 4 * MILLISECOND
-    """Most schedules: the gate's input is fresh then, and the loop free."""
+    """For most schedules: the gate's inputs are fresh at its tick, and the loop is free."""
     ESTIMATES = 5 * MILLISECOND
-    """Services whose estimates the others use."""
+    """For services whose estimates others use."""
     POLLING = 8 * MILLISECOND
-    """Services that query a device: unless its line is slow, the answer is there when the estimates are made."""
+    """For services that query a device: unless its line is slow, the answer arrives before the estimates are made."""
     IN_THREADS = -2 * MILLISECOND
-    """Services that work in threads: behind the tick, which a thread that holds the interpreter would delay."""
+    """For services that work in threads: after the tick, which a thread holding the interpreter lock would delay."""
 
 
 class Schedule:
-    """Instants on a fixed grid. Instants missed by a millisecond are skipped.
+    """Instants on a fixed grid. Instants missed by a millisecond or more are skipped.
 
     Schedules of one rate have the same instants, so that services wake together: a loop that sleeps in between runs
-    code from cold caches, and the first service to run pays for the others.
+    with cold caches, and the first service to run warms them for the others.
 
     Args:
-        clock: time.
+        clock: source of time.
         rate: instants per second.
-        ahead: of the multiples of the period, ns; negative: behind them.
+        ahead: lead over the multiples of the period, ns; negative: lag.
     """
 
     def __init__(self, clock: Clock, rate: float, ahead: int = Lead.BEFORE_GATE) -> None:
@@ -495,10 +502,10 @@ class Schedule:
         self._period = round(SECOND / rate)
         self._ahead = ahead
         self._behind: int | None = None
-        """The next instant is the grid's first one behind this."""
+        """The next instant is the first one of the grid after this time."""
 
     async def next(self) -> int:
-        """Wait for the next instant; returns when it was due, ns."""
+        """Wait for the next instant; return its time, ns."""
         due = self._step(self._clock.now() - MILLISECOND)
         await self._clock.sleep_until(due)
         return due
@@ -511,7 +518,7 @@ class Schedule:
         return due
 
     def _step(self, earliest: int) -> int:
-        """The next instant behind ``earliest``: at once the first time; the second is half a period off at least."""
+        """Next instant after ``earliest``: the first one immediately, the second at least half a period later."""
         if self._behind is None:
             now = self._clock.now()
             due = now - now % MILLISECOND

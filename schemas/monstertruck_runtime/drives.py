@@ -1,7 +1,7 @@
 """A task or a drive along a path, as a client of the robot: from the request to the outcome.
 
-`run_task` is the one session of all clients with a goal, an exploration, a mission or a behaviour: it starts the task,
-arms the robot if it may, follows the reports, and stops the task when it is cancelled or the robot falls silent.
+All clients use `run_task` for a goal, an exploration, a mission or a behaviour: it starts the task, arms the robot if
+allowed, follows the reports, and stops the task when it is cancelled or the robot falls silent.
 """
 
 import asyncio
@@ -37,22 +37,22 @@ S = TypeVar("S", GoalState, ExplorationState, MissionState, BehaviourState)
 E = TypeVar("E")
 
 STAND_LOOK_PERIOD: Final = 0.5
-"""Half the period of reports why the truck stands, s."""
+"""Half the period of reports about why the truck stands, s."""
 ACCEPT_TIMEOUT: Final = 3.0
 """Time limit for the acceptance of a path (s)."""
 
 
 class DriveReport:
-    """Progress reports of a drive; this base reports nothing."""
+    """Receiver of progress reports of a drive; this base ignores them."""
 
     def waiting(self, text: str, share: float) -> None:
-        """The planner is starting; ``share`` of the time allowed has passed."""
+        """Report that the planner is starting; ``share`` of the allowed time has passed."""
 
     def under_way(self, what: str, share: float) -> None:
-        """Driven so far, 0..1."""
+        """Report the fraction driven so far, 0..1."""
 
     def stands(self, gate: GateState, why: str) -> None:
-        """The truck stands, for a reason not yet reported; ``why`` holds all reasons in words."""
+        """Report a new reason why the truck stands; ``why`` contains all reasons in words."""
 
 
 SILENT: Final = DriveReport()
@@ -60,30 +60,30 @@ SILENT: Final = DriveReport()
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """How a drive ended."""
+    """Result of a drive."""
 
     reason: Reason
     text: str
     length: float
-    """Metres of the first route, or of the path."""
+    """Length of the first route, or of the path, m."""
     elapsed: float
-    """Seconds."""
+    """Duration, s."""
     routes: int = 1
     recoveries: int = 0
 
     def as_json(self) -> dict[str, Any]:
-        """Everything as plain data."""
+        """Return all values as plain data."""
         return asdict(self)
 
 
 @dataclass(frozen=True, slots=True)
 class TaskEnd(Generic[S]):
-    """How a task ended."""
+    """Result of a task."""
 
     reason: Reason
     text: str
     state: S | None
-    """Latest report on it."""
+    """Latest report about the task."""
 
 
 async def run_task(
@@ -103,17 +103,17 @@ async def run_task(
     """Start a task and wait for its end; stop it if cancelled or unanswered, unless another client started it.
 
     Args:
-        client: who starts it.
+        client: client that starts it.
         topic: topic of its reports.
         needs: the service that runs the task.
-        start: requests it; the answer has its ``number``.
+        start: sends the request; the answer contains its ``number``.
         stop: stops the task, if this client started it.
-        show: gets every report.
-        arm: arm a robot that is disarmed.
-        waits: a task of this kind is accepted by a disarmed robot, and waits until it is armed.
-        report: gets why the robot stands, by ``clock``.
-        clock: time.
-        to_its_end: when cancelled, wait until the robot has stopped the task, and return how it ended.
+        show: receives every report.
+        arm: whether to arm a disarmed robot.
+        waits: whether a disarmed robot accepts a task of this kind and waits until it is armed.
+        report: receives the reason why the robot stands, by ``clock``.
+        clock: source of time.
+        to_its_end: when cancelled, wait until the robot has stopped the task, and return its result.
 
     Raises:
         RequestRefusedError: the start or the arming was refused, the service failed, or the robot restarted.
@@ -133,7 +133,7 @@ async def _task_end(states: Mailbox[S], number: int, show: Callable[[S], object]
     last: S | None = None
     async for state in states:
         if state.number > number:
-            return TaskEnd(Reason.CANCELLED, f"{state.source} started another one", last)
+            return TaskEnd(Reason.CANCELLED, f"{state.source} started another task", last)
         if state.number == number:
             show(state)
             last = state
@@ -151,7 +151,7 @@ async def drive_to(
     arm: bool,
     report: DriveReport = SILENT,
 ) -> Arrival:
-    """Send a goal and wait for its end. Raises as ``run_task`` does."""
+    """Send a goal and wait for its end. Raises the errors of ``run_task``."""
     length = 0.0
 
     def show(state: GoalState) -> None:
@@ -176,10 +176,10 @@ async def _taken_on(
     via: Sequence[tuple[float, ...]],
     report: DriveReport,
 ) -> dict[str, Any]:
-    """Answer to the goal; while the planner is starting it is sent again and again.
+    """Return the answer to the goal; repeat the request while the planner is starting.
 
     Raises:
-        RequestRefusedError: for another reason, or the planner takes longer than 240 s.
+        RequestRefusedError: refused for another reason, or the planner needs more than 240 s.
         NoAnswerError: the robot does not answer.
     """
     began = clock.now()
@@ -188,7 +188,7 @@ async def _taken_on(
             return await driver.goal(goal, via=via)
         except RequestRefusedError as refused:
             waited = (clock.now() - began) / SECOND
-            planner_start = 240.0  # seconds that a planner may take to start
+            planner_start = 240.0  # maximum start time of a planner (s)
             if refused.refusal is not Reason.PLANNER_STARTING or waited > planner_start:
                 raise
             report.waiting(str(refused), waited / planner_start)
@@ -197,7 +197,7 @@ async def _taken_on(
 
 @asynccontextmanager
 async def taken_back(undo: Callable[[], Awaitable[object]]) -> AsyncIterator[None]:
-    """``undo`` a request inside that is cancelled or not answered: the robot may carry it out all the same."""
+    """Context that calls ``undo`` if its request is cancelled or unanswered: the robot may still carry it out."""
     try:
         yield
     except (asyncio.CancelledError, NoAnswerError):
@@ -215,17 +215,17 @@ async def follow(
     report: DriveReport = SILENT,
     disarmed_for: float = math.inf,
 ) -> Arrival:
-    """Send a path and wait for its end; cancelled or without an answer, it stops the truck, but not on another path.
+    """Send a path and wait for its end; if cancelled or unanswered, stop the truck unless it follows another path.
 
-    Then the path is withdrawn, so that arming the truck later does not drive it.
+    The path is then withdrawn, so that arming the truck later does not drive it.
 
     Args:
-        driver: who sends it.
-        clock: time.
-        path: what is to be driven.
-        arm: arm a robot that is disarmed.
-        report: gets progress.
-        disarmed_for: seconds without arming after which the path is given up.
+        driver: client that sends it.
+        clock: source of time.
+        path: path to drive.
+        arm: whether to arm a disarmed robot.
+        report: receives the progress.
+        disarmed_for: time without arming after which the path is abandoned, s.
 
     Raises:
         RequestRefusedError: the path or the arming was refused, the tracker failed, or the robot restarted.
@@ -238,8 +238,7 @@ async def follow(
         driver.subscribe(PATH, latest()) as present,
     ):
         with suppress(TimeoutError):
-            # 2.0: seconds that a path waits for a truck that is still moving: one that has just reached its goal comes
-            # to rest
+            # 2.0: seconds that a path waits for a truck that is still coming to rest
             async with clock.deadline(2.0):
                 while (await stand.gate.next()).mode.moving:
                     pass
@@ -305,16 +304,16 @@ async def begun(
     *,
     arm: bool,
 ) -> dict[str, Any]:
-    """Start a task; returns the robot's answer.
+    """Start a task; return the robot's answer.
 
-    The robot is armed only when nothing else is in the way, and held until the task has started: a path that it has
-    would be driven meanwhile. It is disarmed again if nothing comes of it.
+    The robot is armed only if all other conditions are met, with planners held until the task has started, because it
+    would otherwise drive a configured path. If the start fails, it is disarmed again.
 
     Args:
-        driver: who starts it.
-        start: asks the robot for it.
-        undo: ends it.
-        arm: arm a robot that is disarmed.
+        driver: client that starts it.
+        start: sends the request.
+        undo: ends the task.
+        arm: whether to arm a disarmed robot.
 
     Raises:
         RequestRefusedError: the start or the arming was refused.
@@ -341,18 +340,18 @@ async def begun(
 
 
 def named(path: Path, clock: Clock) -> Path:
-    """The path under a unique name."""
+    """Return the path under a unique name."""
     return path.model_copy(update={"name": f"{path.name[:96]}-{clock.now():x}"})
 
 
 async def send_path(driver: TruckClient, clock: Clock, path: Path, present: Mailbox[Path]) -> None:
-    """Send a path and wait until it is followed.
+    """Send a path and wait until the tracker follows it.
 
     Args:
-        driver: who sends it.
-        clock: time.
+        driver: client that sends it.
+        clock: source of time.
         path: path to drive, with a unique name.
-        present: the robot's latest path.
+        present: latest path of the robot.
 
     Raises:
         RequestRefusedError: the path was refused.
@@ -383,11 +382,11 @@ async def _until_followed(clock: Clock, present: Mailbox[Path], name: str) -> No
             while not _followed(present, name):
                 await present.next()
     except TimeoutError:
-        raise NoAnswerError(f"the path {name!r} did not come within {ACCEPT_TIMEOUT:g} s") from None
+        raise NoAnswerError(f"the path {name!r} was not received within {ACCEPT_TIMEOUT:g} s") from None
 
 
 async def _disarmed(clock: Clock, stand: StandstillMonitor, timeout: float = 0.0) -> Arrival:
-    """The end of a path that is over once the robot has been disarmed for ``timeout`` seconds."""
+    """End of a path that is abandoned once the robot has been disarmed for ``timeout`` seconds."""
     begin = active = clock.now()
     while (state := stand.gate.latest) is None or state.mode.active or clock.now() - active < timeout * SECOND:
         if state is None or state.mode.active:
@@ -398,7 +397,7 @@ async def _disarmed(clock: Clock, stand: StandstillMonitor, timeout: float = 0.0
 
 
 async def _first(*ends: Coroutine[Any, Any, Arrival]) -> Arrival:
-    """The end that comes first."""
+    """Return the first of two ends."""
     tasks = [asyncio.create_task(end) for end in ends]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -419,7 +418,7 @@ async def _path_end(
     begin, length = clock.now(), 0.0
     async for state in states:
         if not _followed(present, name):
-            return Arrival(Reason.CANCELLED, "another path is followed now", length, (clock.now() - begin) / SECOND)
+            return Arrival(Reason.CANCELLED, "the tracker follows another path", length, (clock.now() - begin) / SECOND)
         if state.path != name:
             continue
         length = state.length
@@ -440,17 +439,17 @@ async def _watched(
     undo: Callable[[], Awaitable[object]],
     to_its_end: bool = False,
 ) -> E:
-    """Wait for the end; ``undo`` if cancelled or refused, unless the robot restarted."""
+    """Wait for the end; call ``undo`` if cancelled or refused, unless the robot restarted."""
     ending = asyncio.ensure_future(while_it_runs(driver, end(), needs))
     try:
         if arm and not ((state := stand.gate.latest) is not None and state.mode.active):
-            # A truck that is armed already may have started to drive.
+            # An already armed truck may have started to drive.
             try:
                 async with taken_back(driver.disarm):
                     await driver.arm()
             except RequestRefusedError as error:
                 raise RequestRefusedError(error.refusal, f"arm refused: {error}") from None
-        return await asyncio.shield(ending)  # one reader of the reports to the end: a second one would miss some
+        return await asyncio.shield(ending)  # one reader of the reports until the end: a second one would miss some
     except TruckError as error:
         if not isinstance(error, RequestRefusedError) or error.refusal is not Reason.SHUTDOWN:
             with suppress(TruckError):  # report the failure rather than the failed undo
@@ -472,7 +471,7 @@ async def _watched(
 
 @asynccontextmanager
 async def reported(stand: StandstillMonitor, clock: Clock | None, report: DriveReport | None) -> AsyncIterator[None]:
-    """Report why the truck stands while the body runs."""
+    """Report why the truck stands while the body of the context runs."""
     watching = None
     if clock is not None and report is not None:
         watching = asyncio.create_task(_say_why_it_stands(stand, clock, report))

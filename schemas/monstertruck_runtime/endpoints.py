@@ -1,4 +1,4 @@
-"""Endpoints of Zenoh, such as ``tcp/127.0.0.1:7447``, and the Unix socket of a daemon on the same machine."""
+"""Zenoh endpoints, such as ``tcp/127.0.0.1:7447``, and the Unix socket of a daemon on the same machine."""
 
 import os
 import socket
@@ -16,15 +16,17 @@ _ADDRESSED: Final = ("tcp", "tls", "udp", "quic", "ws")
 """Protocols whose addresses are a host and a port."""
 _OTHERS: Final = ("unixsock-stream", "unixpipe", "vsock", "serial")
 ANNOUNCED: Final = "monstertruckd/"
-"""Prefix of the abstract Unix socket that shows a daemon to all users; its ports, protocol and robot follow."""
+"""Prefix of the abstract Unix socket that announces a daemon to all users; followed by its ports, protocol and
+robot.
+"""
 EVERYWHERE: Final = ("0.0.0.0", "::")  # noqa: S104
-"""Addresses that stand for all interfaces."""
+"""Addresses that mean all interfaces."""
 ANSWERS_WITHIN: Final = 0.2
 """Timeout of a connection to a program on this machine (s)."""
 
 
 def is_endpoint(text: str) -> bool:
-    """Whether ``text`` has the form of an endpoint: a protocol that Zenoh knows, and an address."""
+    """Whether ``text`` has the form of an endpoint: a protocol supported by Zenoh, and an address."""
     if protocol_of(text) in _ADDRESSED:
         port = port_of(text)
         return bool(host_of(text)) and port is not None and port <= 65_535
@@ -32,7 +34,7 @@ def is_endpoint(text: str) -> bool:
 
 
 def endpoint_of(protocol: str, host: str, port: int) -> str:
-    """Endpoint of a host name or address; IPv6 addresses stand in brackets."""
+    """Endpoint of a host name or address; IPv6 addresses are put in brackets."""
     return f"{protocol}/[{host}]:{port}" if ":" in host else f"{protocol}/{host}:{port}"
 
 
@@ -53,7 +55,7 @@ def port_of(endpoint: str) -> int | None:
 
 
 def runtime_folder(environment: Mapping[str, str] = os.environ) -> Path:
-    """Folder of sockets and emulated ports: made by systemd for the service, or one of the user."""
+    """Folder of sockets and emulated ports: created by systemd for the service, or a folder of the user."""
     if given := environment.get("RUNTIME_DIRECTORY"):
         return Path(given.partition(":")[0])
     runtime = environment.get("XDG_RUNTIME_DIR")
@@ -61,20 +63,20 @@ def runtime_folder(environment: Mapping[str, str] = os.environ) -> Path:
 
 
 def emulated_ports(robot: str, environment: Mapping[str, str] = os.environ) -> Path:
-    """Folder of the emulated devices of a robot, for this user alone: where a configuration names no ports."""
+    """Folder of the emulated devices of a robot, private to this user; used if a configuration sets no ports."""
     return runtime_folder(environment) / "ports" / robot
 
 
 def local_endpoint(listen: Iterable[str], environment: Mapping[str, str] = os.environ) -> str | None:
-    """Unix socket of a daemon that listens there, named after the first port; None without a port."""
+    """Unix socket of a daemon listening there, named after the first port; None without a port."""
     port = next((port for endpoint in listen if (port := port_of(endpoint))), None)
     return None if port is None else f"{UNIX}{runtime_folder(environment)}/{port}.sock"
 
 
 def nearest(endpoint: str, environment: Mapping[str, str] = os.environ) -> str:
-    """Unix socket of the daemon behind a TCP endpoint of this machine, if one answers.
+    """Unix socket of the daemon behind a TCP endpoint of this machine, if it answers.
 
-    Its connections are separate from the stations', so it answers when all stations' places are taken.
+    It has its own connections, so it answers even if stations use all TCP connections.
     """
     port = port_of(endpoint)
     if protocol_of(endpoint) != "tcp" or host_of(endpoint) not in LOCAL_HOSTS or port is None:
@@ -87,11 +89,11 @@ def nearest(endpoint: str, environment: Mapping[str, str] = os.environ) -> str:
 
 
 class Announced(NamedTuple):
-    """A daemon as it shows itself to every user of this computer."""
+    """A daemon as announced to all users of this computer."""
 
     port: int
     protocol: str
-    """``tls`` where it requires a certificate."""
+    """``tls`` if it requires a certificate."""
     robot: str
     others: tuple[int, ...] = ()
     """Ports of its other endpoints."""
@@ -103,9 +105,9 @@ class Announced(NamedTuple):
 
 
 def local_endpoints(environment: Mapping[str, str] = os.environ, *, near: str = DEFAULT_ENDPOINT) -> list[str]:
-    """Return an endpoint of each daemon that answers on this machine, by port, the port of ``near`` first.
+    """Return one endpoint of each daemon that answers on this machine, sorted by port, the port of ``near`` first.
 
-    Only Unix sockets of this user and of the service are tried; a daemon of another user is reached by its port. Of
+    Only Unix sockets of this user and of the service are tried; a daemon of another user is reached by its port. Among
     several endpoints of a daemon ``near`` is preferred, then its Unix socket.
     """
     folders = runtime_folder(environment), SERVICE_FOLDER
@@ -128,14 +130,14 @@ def local_endpoints(environment: Mapping[str, str] = os.environ, *, near: str = 
 
 
 def announce(robot: str, listen: Iterable[str]) -> socket.socket | None:
-    """Let every user of this computer see a daemon, without reading its folders, until the socket is closed.
+    """Announce a daemon to all users of this computer until the socket is closed.
 
     Args:
-        robot: its name.
-        listen: endpoints of the daemon; the first that is reached from this computer is shown.
+        robot: name of the robot.
+        listen: endpoints of the daemon; the first one reachable from this computer is announced.
 
     Returns:
-        Socket that holds the name; the kernel drops it when the process ends. None if the endpoints are for other
+        Socket that holds the name; the kernel removes it when the process ends. None if the endpoints are on other
         computers, or another program holds the name.
     """
     hosts, listen = (*LOCAL_HOSTS, *EVERYWHERE), tuple(listen)
@@ -154,7 +156,7 @@ def announce(robot: str, listen: Iterable[str]) -> socket.socket | None:
 
 
 def announced(table: Path = Path("/proc/net/unix")) -> list[Announced]:
-    """Daemons of every user that announce themselves."""
+    """Announced daemons of all users."""
     try:
         names = [line.rpartition(" @")[2] for line in table.read_text(errors="replace").splitlines()]
     except OSError:
@@ -171,7 +173,7 @@ def announced(table: Path = Path("/proc/net/unix")) -> list[Announced]:
 
 
 def public(endpoint: str) -> str:
-    """An endpoint as a user writes it: the port of a Unix socket as an address of this machine."""
+    """Endpoint in the form used by users: the port of a Unix socket as an address of this machine."""
     if not endpoint.startswith(UNIX):
         return endpoint
     port = Path(endpoint.removeprefix(UNIX)).stem
@@ -185,10 +187,12 @@ def robot_on_host(robot: str, endpoint: str) -> str:
 
 
 def make_private(folder: Path) -> None:
-    """Make the folder of sockets and ports; an existing one must belong to this user and be writable by no other.
+    """Create the folder of sockets and ports.
+
+    An existing one must belong to this user and be writable by this user only.
 
     Raises:
-        OSError: it cannot be made, or others may put sockets into it.
+        OSError: it cannot be created, or others may put sockets into it.
     """
     folder.mkdir(mode=0o750, parents=True, exist_ok=True)
     status = folder.lstat()

@@ -10,13 +10,13 @@ E = TypeVar("E", bound=BaseException)
 
 
 class TruckError(Exception):
-    """Root of all expected failures; anything else is a bug."""
+    """Root of all expected failures; any other exception is a bug."""
 
     reason: ClassVar[Reason] = Reason.INTERNAL
 
 
 class ConfigError(TruckError):
-    """A configuration was refused; the text names file, line, key and expectation."""
+    """A configuration is invalid; the text names file, line, key and expected value."""
 
     reason = Reason.BAD_CONFIG
 
@@ -25,8 +25,8 @@ class UnusableFileError(ConfigError):
     """A file written by the robot, such as saved settings or a calibration, cannot be used.
 
     Args:
-        file: its path.
-        why: text that names file, place and expectation.
+        file: path of the file.
+        why: text that names file, place and expected content.
     """
 
     def __init__(self, file: Path, why: str) -> None:
@@ -35,13 +35,13 @@ class UnusableFileError(ConfigError):
 
 
 class InputError(TruckError):
-    """Other input (map, log, path, argument) was refused; the text names the expectation."""
+    """Other input (map, log, path, argument) is invalid; the text states the expected content."""
 
     reason = Reason.BAD_INPUT
 
 
 class DamagedFileError(InputError):
-    """A file that a service stands on cannot be read; retrying cannot help."""
+    """A file that a service depends on cannot be read; a retry is useless."""
 
 
 class NotFoundError(TruckError):
@@ -57,13 +57,13 @@ class BusyError(TruckError):
 
 
 class NotInstalledError(TruckError):
-    """A library that an extra brings is not installed."""
+    """A library from an extra is not installed."""
 
     reason = Reason.NOT_INSTALLED
 
 
 class NotPermittedError(TruckError):
-    """The user lacks a right; the text explains how to get it."""
+    """The user lacks a permission; the text explains how to get it."""
 
     reason = Reason.NOT_PERMITTED
 
@@ -89,19 +89,19 @@ class RequestRefusedError(TruckError):
 
 
 class DeviceError(TruckError):
-    """Anything a device or its link did; the supervisor restarts the service."""
+    """Any failure of a device or its link; the supervisor restarts the service."""
 
     reason = Reason.DEVICE_FAULT
 
 
 class DeviceLostError(DeviceError):
-    """The port vanished or was closed: unplugged."""
+    """The port disappeared or was closed: unplugged."""
 
     reason = Reason.DEVICE_LOST
 
 
 class DeviceWedgedError(DeviceLostError):
-    """The device takes no bytes, or the kernel waits for it when its port is opened or closed."""
+    """The device accepts no bytes, or the kernel waits for it when its port is opened or closed."""
 
     reason = Reason.DEVICE_WEDGED
 
@@ -113,7 +113,7 @@ class DeviceRestartedError(DeviceLostError):
 
 
 class DeviceStoppedError(DeviceError):
-    """The device stopped although this program wanted motion: a hardware line or another master did it."""
+    """The device stopped without a command of this program: a hardware line or another master did it."""
 
     reason = Reason.DEVICE_STOPPED
 
@@ -125,7 +125,7 @@ class DeviceTimeoutError(DeviceError):
 
 
 class ProtocolError(DeviceError):
-    """Bytes against the device's protocol."""
+    """The device violated its protocol."""
 
     reason = Reason.DEVICE_PROTOCOL
 
@@ -149,7 +149,7 @@ class PortBusyError(DeviceError):
 
 
 class DeviceMismatchError(DeviceError):
-    """Device's parameters contradict the configuration; retrying cannot help."""
+    """The device's parameters contradict the configuration; a retry is useless."""
 
     reason = Reason.DEVICE_MISMATCH
 
@@ -172,7 +172,7 @@ def disk_reason(error: OSError) -> Reason:
 
 
 def first_of(error: BaseException, kind: type[E]) -> E | None:
-    """First exception of a kind in a tree of groups, which may be the exception itself; None without one."""
+    """First exception of a kind in an exception group, which may be the exception itself; None without one."""
     if isinstance(error, BaseExceptionGroup):
         found = (first_of(each, kind) for each in error.exceptions)
         return next((each for each in found if each is not None), None)

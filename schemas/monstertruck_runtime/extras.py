@@ -1,6 +1,6 @@
 """Extras of the distribution: their packages, and the command that installs missing ones.
 
-The distribution itself is in no package index, so a command names the packages of an extra.
+The distribution itself is not in a package index, so a command names the packages of an extra.
 """
 
 import json
@@ -25,7 +25,7 @@ class Requirement(NamedTuple):
     inner: tuple[str, ...]
     """Extras of the required distribution."""
     versions: str
-    """Such as ``>=1.3``; empty if every version will do."""
+    """Version specifier such as ``>=1.3``; empty for any version."""
     extra: str
     """Extra that requires it; empty if it is always required."""
 
@@ -34,7 +34,7 @@ class Requirement(NamedTuple):
         """Parse a requirement (PEP 508, without a URL).
 
         Raises:
-            ValueError: it begins with no name.
+            ValueError: it does not start with a name.
         """
         found = re.match(r"\s*([\w.-]+)\s*(?:\[([^]]*)\])?\s*\(?([^;()]*)\)?", line)
         if found is None:
@@ -45,7 +45,7 @@ class Requirement(NamedTuple):
 
 
 def required(extra: str, lines: Sequence[str]) -> Iterator[Requirement]:
-    """Requirements of an extra in a distribution's metadata, nested extras included."""
+    """Requirements of an extra in a distribution's metadata, including nested extras."""
     for line in lines:
         requirement = Requirement.parse(line)
         if requirement.extra != extra:

@@ -13,21 +13,24 @@ M = TypeVar("M", bound=Message)
 
 @dataclass(frozen=True, slots=True)
 class Delivery:
-    """How many unread messages wait, and whether losing the oldest one is a loss; see ``latest`` and ``fifo``."""
+    """Maximum number of unread messages, and whether dropping the oldest counts as a loss.
+
+    See ``latest`` and ``fifo``.
+    """
 
     depth: int
     counted: bool
 
 
 def latest() -> Delivery:
-    """Only the latest message waits; older ones are superseded and do not count as lost."""
+    """Keep only the latest message; replaced messages do not count as lost."""
     return Delivery(1, counted=False)
 
 
 def fifo(depth: int) -> Delivery:
-    """Up to ``depth`` messages wait in order; beyond that the oldest is lost and counted."""
+    """Keep up to ``depth`` messages in order; beyond that the oldest is dropped and counted."""
     if depth < 1:
-        raise ValueError(f"a FIFO holds at least one message, not {depth}")
+        raise ValueError(f"a FIFO holds at least one message, got {depth}")
     return Delivery(depth, counted=True)
 
 
@@ -51,21 +54,21 @@ class Mailbox(Generic[M]):
 
     @property
     def latest(self) -> M | None:
-        """Latest message, or None before the first; reading it consumes nothing."""
+        """Latest message, or None before the first; reading it does not consume it."""
         return self._latest
 
     @property
     def drops(self) -> int:
-        """Messages lost because the FIFO was full."""
+        """Number of messages lost because the FIFO was full."""
         return self._drops
 
     def lose(self, count: int) -> None:
-        """Count messages that were lost on their way here."""
+        """Count messages lost before they reached this mailbox."""
         if self._counted:
             self._drops += count
 
     def put(self, message: M) -> None:
-        """Deliver ``message``; never blocks. A waiting reader runs in the loop's next turn."""
+        """Deliver ``message``; never blocks. A waiting reader runs in the next loop iteration."""
         if self._closed:
             return
         self._latest = message
@@ -92,18 +95,18 @@ class Mailbox(Generic[M]):
         return self._unread.popleft()
 
     async def next_within(self, seconds: float, take: Callable[[M], bool] | None = None) -> M | None:
-        """Return as ``next``, or None if nothing comes within ``seconds``.
+        """Return as ``next`` does, or None if no message arrives within ``seconds``.
 
         A timer costs much less than a deadline, which has to cancel its task, and ``take`` much less than a wake-up.
 
         Args:
-            seconds: limit.
-            take: gets a message that comes during the wait at once, in its writer's own callback; if it returns True
-                the wait continues, and the message counts as read.
+            seconds: timeout, s.
+            take: called immediately with a message that arrives during the wait, in its writer's callback; if it
+                returns True the wait continues, and the message counts as read.
 
         Raises:
-            RuntimeError: as ``next``.
-            Exception: what ``take`` raised.
+            RuntimeError: as for ``next``.
+            Exception: raised by ``take``.
         """
         due = asyncio.get_running_loop().time() + max(seconds, 0.0)
         while not self._unread and not self._closed:
@@ -112,13 +115,13 @@ class Mailbox(Generic[M]):
         return await self.next()
 
     def drain(self) -> list[M]:
-        """Everything unread, oldest first, without waiting."""
+        """Return all unread messages, oldest first, without waiting."""
         unread = list(self._unread)
         self._unread.clear()
         return unread
 
     def close(self) -> None:
-        """End the subscription; unread messages are gone and iteration ends. Closing twice is harmless."""
+        """End the subscription; unread messages are discarded and iteration ends. Repeated calls have no effect."""
         if self._closed:
             return
         self._closed = True
@@ -128,9 +131,9 @@ class Mailbox(Generic[M]):
         self._on_close(self)
 
     async def _news(self, due: float | None = None, take: Callable[[M], bool] | None = None) -> bool:
-        """Wait for the next message or the end; False if ``due``, loop time, came first."""
+        """Wait for the next message or the end; return False if ``due`` (loop time) came first."""
         if self._reader is not None:
-            raise RuntimeError("a subscription has one reader; subscribe again for another")
+            raise RuntimeError("a subscription has only one reader; subscribe again for another")
         loop = asyncio.get_running_loop()
         reader: asyncio.Future[bool] = loop.create_future()
         self._reader, self._take = reader, take

@@ -1,4 +1,4 @@
-"""Occupancy maps in the map_server format: one YAML file that names one image.
+"""Occupancy maps in the map_server format: a YAML file that refers to an image.
 
 Unlike in the image, row 0 of the array is the lowest y, so cell (row, column) covers
 ``origin + resolution * ([column, column + 1], [row, row + 1])``.
@@ -34,7 +34,7 @@ MOST_CELLS: Final = MOST_PIXELS
 _REQUIRED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
 _MODES = ("trinary", "scale", "raw")
 _BAND: Final = 1_000_000
-"""Pixels that are converted at once."""
+"""Number of pixels converted at once."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +45,7 @@ class WorldMap:
         cells: int8 (rows, columns), ``FREE`` to ``OCCUPIED`` percent or ``UNKNOWN``; row 0 is the lowest y; read-only.
         resolution: side of a cell, m.
         origin: x, y of the outer corner of cell (0, 0), m.
-        others: further keys of its YAML file; ``save_map`` writes them back.
+        others: other keys of its YAML file; ``save_map`` writes them back.
         remarks: warnings about its files.
     """
 
@@ -75,19 +75,19 @@ class WorldMap:
 
 
 def load_map(path: Path) -> WorldMap:
-    """Read a map_server YAML file and its image, or the latest whole save in the folder of a map.
+    """Read a map_server YAML file and its image, or the latest intact save in the folder of a map.
 
-    Cells have the values that nav2's map_server publishes. With p = darkness in 0..1 (lightness if ``negate``),
-    p > occupied_thresh is occupied, p < free_thresh free, the rest unknown. ``mode: scale`` spreads the rest over
-    0..100, and makes transparent pixels unknown; ``mode: raw`` takes the lightness in 255ths as percent. Colour counts
-    by the mean of its channels, to which ``mode: trinary`` adds alpha. A yaw of the origin turns the cells into the
-    map frame.
+    Cells have the values that nav2's map_server publishes. With p = darkness in 0..1 (lightness if ``negate``), p >
+    occupied_thresh is occupied, p < free_thresh free, the rest unknown. ``mode: scale`` spreads the rest over 0..100,
+    and makes transparent pixels unknown; ``mode: raw`` uses the lightness in 255ths as percent. Colours are averaged
+    over their channels, to which ``mode: trinary`` adds alpha. A yaw of the origin rotates the cells into the map
+    frame.
 
-    The image path is relative to the YAML file, absolute, or starts with ``~``. If an absolute path is missing, the
-    file of that name next to the YAML file is read.
+    The image path is relative to the YAML file, absolute, or starts with ``~``. If an absolute path does not exist, the
+    file of the same name next to the YAML file is read.
 
     Raises:
-        InputError: file, key and expectation of whatever is wrong.
+        InputError: invalid content; the message names file, key and expected value.
     """
     folder = folder_of(path)
     if folder is None:
@@ -97,7 +97,7 @@ def load_map(path: Path) -> WorldMap:
 
 
 def load_saved(save: MapSave) -> WorldMap:
-    """Read the grid of an open save; its remarks join the map's.
+    """Read the grid of an open save; its remarks are added to the map's.
 
     Raises:
         InputError: see ``load_map``.
@@ -121,16 +121,16 @@ def _load(path: Path) -> WorldMap:
             cells, origin = turned(cells, resolution, (*origin, float(yaw)))
         except ValueError as error:
             raise InputError(f"{path}: origin: {error}") from error
-    remarks = [f"{path}: {key}: unknown key, left as it is" for key in others]
+    remarks = [f"{path}: {key}: unknown key, left unchanged" for key in others]
     if not (cells >= OCCUPIED_FROM).any():
-        remarks.append(f"{path}: not one occupied cell: check image, negate and the thresholds")
+        remarks.append(f"{path}: no occupied cell: check image, negate and the thresholds")
     return WorldMap(cells, resolution, origin, others, tuple(remarks))
 
 
 def files_of(place: Path) -> list[Path]:
-    """Return the files of a map that ``load_map`` needs: the latest whole save, or YAML and image.
+    """Return the files of a map that ``load_map`` needs: those of the latest intact save, or YAML and image.
 
-    An image that the YAML names by an absolute path stays where it is, and is left out.
+    An image with an absolute path in the YAML is not included.
 
     Raises:
         InputError: see ``load_map``.
@@ -148,13 +148,15 @@ def files_of(place: Path) -> list[Path]:
 def turned(
     cells: NDArray[np.int8], resolution: float, origin: tuple[float, float, float]
 ) -> tuple[NDArray[np.int8], tuple[float, float]]:
-    """Draw a grid whose lower left corner has the pose ``origin`` (x, y, yaw; m, rad) into cells along the map's axes.
+    """Resample a grid whose lower left corner has the pose ``origin`` (x, y, yaw.
 
-    Every cell takes the value of the one that its centre is in; every occupied cell occupies the one that its own
-    centre is in, so that no wall is lost.
+    M, rad) to cells along the map's axes.
+
+    Every cell takes the value of the cell that contains its centre. Every occupied cell occupies the cell that contains
+    its own centre, so that no wall is lost.
 
     Returns:
-        The new cells, int8 (rows, columns), and x, y of their outer corner, m.
+        New cells, int8 (rows, columns), and x, y of their outer corner, m.
 
     Raises:
         ValueError: there would be more than ``MOST_CELLS``.
@@ -184,11 +186,11 @@ def turned(
 def save_map(world: WorldMap, path: Path) -> None:
     """Write ``path`` (YAML) and a grey PNG of the same stem; ``load_map`` reads back the trinary map.
 
-    The YAML file is replaced last, so it never names the picture of another map: if a different picture has the PNG's
-    name, the new one gets another name, and the former picture is removed at the end.
+    The YAML file is replaced last, so it never refers to the image of another map: if a different image has the PNG's
+    name, the new one gets another name, and the old image is removed at the end.
 
     Raises:
-        OSError: a file could not be written; the map is the one before.
+        OSError: a file could not be written; the previous map is kept.
     """
     _, picture = map_content(world, "")
     image = path.with_suffix(".png")
@@ -202,7 +204,7 @@ def save_map(world: WorldMap, path: Path) -> None:
 
 
 def _picture_of(path: Path) -> str | None:
-    """Name of the picture that ``save_map`` wrote for a YAML file; None if it wrote none."""
+    """Name of the image that ``save_map`` wrote for a YAML file; None if it wrote none."""
     try:
         name = str(_read_keys(path)[0]["image"])
     except InputError:
@@ -211,7 +213,7 @@ def _picture_of(path: Path) -> str | None:
 
 
 def map_content(world: WorldMap, image: str) -> tuple[str, bytes]:
-    """YAML text of a map whose picture is called ``image``, and the picture (PNG)."""
+    """YAML text of a map whose image is named ``image``, and the image (PNG)."""
     shades = np.full(world.cells.shape, 205, dtype=np.uint8)
     shades[(world.cells >= 0) & (world.cells <= FREE_TO)] = 254
     shades[world.cells >= OCCUPIED_FROM] = 0
@@ -230,8 +232,8 @@ def map_content(world: WorldMap, image: str) -> tuple[str, bytes]:
 
 
 def _read_keys(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The keys of map_server, checked, and the others."""
-    no_map = f"{path}: no map: expected the folder of a saved map, or a map_server YAML"
+    """The keys of map_server, validated, and the other keys."""
+    no_map = f"{path}: not a map: expected the folder of a saved map, or a map_server YAML"
     try:
         keys = read_yaml(path)
     except InputError as error:
@@ -298,7 +300,7 @@ def _read_image(source: Path, path: Path, keys: Mapping[str, Any]) -> NDArray[np
 
 @dataclass(frozen=True, slots=True)
 class Shades:
-    """Pixels as numbers: lightness = the mean over channels of ``levels / full``."""
+    """Convert pixels to numbers: lightness = mean over channels of ``levels / full``."""
 
     levels: NDArray[Any]
     """Shape (rows, columns) or (rows, columns, channels)."""
@@ -307,10 +309,10 @@ class Shades:
 
 
 def pixels(image: Image.Image) -> tuple[Shades, NDArray[np.uint8] | None]:
-    """Lightness and alpha of a picture of any of Pillow's modes.
+    """Lightness and alpha of an image in any of Pillow's modes.
 
     Returns:
-        Grey levels or colours, and alpha (rows, columns), 0 transparent to 255; None = all is opaque.
+        Grey levels or colours, and alpha (rows, columns), 0 transparent to 255; None: opaque.
 
     Raises:
         OSError, ValueError, and others: Pillow cannot decode or convert it.
@@ -332,7 +334,7 @@ def pixels(image: Image.Image) -> tuple[Shades, NDArray[np.uint8] | None]:
 
 
 def _white(image: Image.Image) -> float:
-    """Level of white in a picture of one channel of numbers."""
+    """Level of white in an image with one channel of numbers."""
     if image.mode == "F":
         return 1.0
     if not isinstance(image, TiffImagePlugin.TiffImageFile):

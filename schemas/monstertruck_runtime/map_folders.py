@@ -1,11 +1,11 @@
-"""Folders of saved maps: every save is a separate folder, whole or absent.
+"""Folders of saved maps: every save is a separate folder, written atomically.
 
-``saves/NNNNNN`` below a map's folder holds one save: grid, pose graph, ground and points of interest, and a manifest
+``saves/NNNNNN`` below a map's folder contains one save: grid, pose graph, ground and points of interest, and a manifest
 with their checksums. It is written under another name, synced and renamed. Files that a writer does not replace are
-taken over from the previous save of the same run; another run makes another map, with another origin. Readers take the
-latest whole save.
+taken from the previous save of the same run; another run makes another map, with another origin. Readers use the latest
+intact save.
 
-Folders of earlier versions, and of other programs, hold their files without a manifest.
+Folders of earlier versions and of other programs contain their files without a manifest.
 """
 
 import errno
@@ -36,7 +36,7 @@ SAVES: Final = "saves"
 MANIFEST: Final = "manifest.json"
 _NUMBER: Final = re.compile(r"\d{6,}")
 _LOOSE: Final = (YAML, "map.png", "graph.npz", "ground.npz", "points.json", "point-*.jpg")
-"""Files of earlier versions, which had no manifest; a new map takes their place."""
+"""Files of earlier versions without a manifest; a new map replaces them."""
 
 
 class _SavedFile(Schema):
@@ -57,7 +57,7 @@ class _Manifest(Schema):
 
 @dataclass(frozen=True, slots=True)
 class MapSave:
-    """One save, as long as it is open."""
+    """One save while it is open."""
 
     folder: Path
     run: str = ""
@@ -68,14 +68,14 @@ class MapSave:
     """Latest save of additions to a map without a manifest."""
 
     def file(self, name: str) -> Path:
-        """Path of a file of the save, which need not be there."""
+        """Path of a file of the save; the file may not exist."""
         if self.beside is not None and (self.beside / name).exists():
             return self.beside / name
         return self.folder / name
 
 
 def folder_of(place: Path) -> Path | None:
-    """The folder of a saved map at ``place``, which may name its ``map.yaml``; None for a map_server YAML elsewhere."""
+    """Folder of the saved map at ``place``, which may be its ``map.yaml``; None for a map_server YAML elsewhere."""
     if place.is_dir():
         return place
     return place.parent if place.name == YAML and (place.parent / SAVES).is_dir() else None
@@ -83,10 +83,10 @@ def folder_of(place: Path) -> Path | None:
 
 @contextmanager
 def opened(folder: Path) -> Iterator[MapSave]:
-    """Yield the latest whole save of a map's folder; it stays until the body ends.
+    """Yield the latest intact save of a map's folder; it is kept until the context ends.
 
     Raises:
-        InputError: all saves are damaged; names file and damage of each.
+        InputError: all saves are damaged; the message names file and damage of each.
     """
     if not (folder / SAVES).is_dir():
         yield MapSave(folder)
@@ -96,7 +96,7 @@ def opened(folder: Path) -> Iterator[MapSave]:
 
 
 def holds_map(folder: Path, run: str) -> bool:
-    """Whether the latest whole save of a grid is of this run."""
+    """Whether the latest intact save of a grid is of this run."""
     try:
         with opened(folder) as save:
             return save.run == run and save.file(YAML).exists()
@@ -109,18 +109,18 @@ def write_save(
 ) -> Path | None:
     """Write a save with ``parts``, and with the previous save's files that are not ``owned``.
 
-    Once this returns, the save outlasts a power cut. The save before is kept, one with the grid before, and
-    the latest map of the run before.
+    When this returns, the save survives a power cut. The previous save, the last one with the previous grid, and the
+    latest map of the previous run are kept.
 
     Args:
         folder: folder of the map.
         parts: content by file name.
-        owned: patterns of the names that the caller answers for: those not among ``parts`` are left out.
-        run: that made the map; None = the run of the map that is there.
-        new: write even if there are neither ``parts`` nor owned files to leave out.
+        owned: patterns of the file names managed by the caller: files not among ``parts`` are omitted.
+        run: run that made the map; None: the run of the existing map.
+        new: write even if there are no ``parts`` and no owned files to omit.
 
     Returns:
-        The folder of the save; None if there was nothing to write.
+        Folder of the save; None if there was nothing to write.
 
     Raises:
         OSError: a file could not be written; the previous save remains the latest.
@@ -159,7 +159,7 @@ def write_save(
 
 
 def tidy(folder: Path) -> list[Path]:
-    """Remove and return leftovers of killed writers in a map's folder.
+    """Remove and return the leftovers of killed writers in a map's folder.
 
     Raises:
         OSError: it cannot be removed.
@@ -181,23 +181,23 @@ def _locked(saves: Path, how: int) -> Iterator[None]:
 
 
 def numbered_saves(saves: Path) -> list[Path]:
-    """Saves in a map's folder of saves, latest first; other entries of the folder are left out."""
+    """Saves in a map's folder of saves, latest first; other entries of the folder are ignored."""
     found = (path for path in saves.iterdir() if _NUMBER.fullmatch(path.name))
     return sorted(found, key=lambda path: int(path.name), reverse=True)
 
 
 def _newest(folder: Path) -> MapSave:
-    """Latest whole save with a grid; without one, the latest whole save.
+    """Latest intact save with a grid; without one, the latest intact save.
 
     Raises:
-        InputError: all are damaged.
+        InputError: all saves are damaged.
     """
     remarks, others = list[str](), list[MapSave]()
     for path in numbered_saves(folder / SAVES):
         try:
             manifest = _check(path)
         except InputError as error:
-            remarks.append(f"{error}; an older save is read")
+            remarks.append(f"{error}; an older save is loaded instead")
             continue
         if YAML in manifest.parts:
             return MapSave(path, manifest.run, tuple(remarks))
@@ -222,7 +222,7 @@ def _run(folder: Path, run: str | None) -> str:
 
 
 def _base(saves: Path, run: str) -> tuple[Path | None, Mapping[str, _SavedFile]]:
-    """Latest whole save of a run, and its content."""
+    """Latest intact save of a run, and its content."""
     for path in numbered_saves(saves):
         try:
             manifest = _check(path)
@@ -234,7 +234,7 @@ def _base(saves: Path, run: str) -> tuple[Path | None, Mapping[str, _SavedFile]]
 
 
 def _check(save: Path) -> _Manifest:
-    """Compare a save with its manifest.
+    """Check a save against its manifest.
 
     Raises:
         InputError: a file is damaged, missing or of another save.
@@ -246,7 +246,7 @@ def _check(save: Path) -> _Manifest:
             if size != part.size:
                 raise InputError(f"{save / name}: {size} bytes, expected {part.size} as in {MANIFEST}")
             if hashlib.file_digest(file, "sha256").hexdigest() != part.sha256:
-                raise InputError(f"{save / name}: its checksum is not that of {MANIFEST}: damaged, or of another save")
+                raise InputError(f"{save / name}: its checksum differs from {MANIFEST}: damaged, or from another save")
     return manifest
 
 
@@ -258,7 +258,7 @@ def _manifest(save: Path) -> _Manifest:
     """
     path, expected = save / MANIFEST, "the manifest of a saved map"
     with reading(path, expected):
-        return _Manifest.model_validate_json(contents(path, expected, 1_000_000))  # size of a manifest at most, bytes
+        return _Manifest.model_validate_json(contents(path, expected, 1_000_000))  # maximum size of a manifest, bytes
 
 
 def _part(data: bytes) -> _SavedFile:
@@ -273,7 +273,7 @@ def _write(path: Path, data: bytes) -> None:
 
 
 def _take_over(old: Path, new: Path) -> None:
-    """Give a file of another save a name in this one; it is copied where files have only one name."""
+    """Link a file of another save into this one; it is copied if the file system has no hard links."""
     try:
         new.hardlink_to(old)
     except OSError as error:
@@ -283,7 +283,7 @@ def _take_over(old: Path, new: Path) -> None:
 
 
 def _prune(saves: Path) -> None:
-    """Remove all saves but the latest two, the latest of two grids that share no file, and another run's last map."""
+    """Remove all saves except the latest two, the latest of two different grids, and the last map of another run."""
     grids, runs = set[int](), set[str]()
     for age, path in enumerate(numbered_saves(saves)):
         grid = {(path / YAML).stat().st_ino} if (path / YAML).exists() else set[int]()
@@ -297,7 +297,7 @@ def _prune(saves: Path) -> None:
 
 
 def _runs_of(save: Path) -> set[str]:
-    """The run of a save; none if its manifest is damaged."""
+    """Run of a save; empty if its manifest is damaged."""
     try:
         return {_manifest(save).run}
     except InputError:
@@ -305,7 +305,7 @@ def _runs_of(save: Path) -> set[str]:
 
 
 def _remove_leftovers(saves: Path) -> list[Path]:
-    """Remove unfinished saves; the folder is locked, so no writer is at one."""
+    """Remove unfinished saves; the folder is locked, so no writer is active."""
     found = list(saves.glob(f"*{SCRATCH}"))
     for path in found:
         shutil.rmtree(path)

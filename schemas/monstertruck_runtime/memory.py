@@ -1,4 +1,4 @@
-"""Settings of the garbage collector, the C library and the kernel for a process's memory."""
+"""Memory settings of the garbage collector, the C library and the kernel for this process."""
 
 import ctypes
 import gc
@@ -11,15 +11,15 @@ _LIBRARY: Final = ctypes.CDLL(None)
 
 
 def settle() -> None:
-    """Declare the loaded objects permanent: the collector skips them, and they move into huge pages.
+    """Make the loaded objects permanent: the garbage collector skips them, and they move to huge pages.
 
-    A full collection over it takes tens of milliseconds, again and again. And a loop that sleeps between short
-    callbacks finds caches and address translation cold: fewer pages save it a few hundredths of its processor time.
-    Takes up to a third of a second: for the end of start-up, before anything moves.
+    A full collection of them takes tens of milliseconds, repeatedly. Fewer pages also save a few hundredths of the
+    processor time of a loop that sleeps between short callbacks and so runs with cold caches. Takes up to a third of a
+    second: call it at the end of start-up, before anything moves.
     """
     gc.collect()
     gc.freeze()
-    huge = 2 * 1024 * 1024  # bytes of a huge page; where it is another size the kernel refuses, and nothing is lost
+    huge = 2 * 1024 * 1024  # size of a huge page, bytes; if it differs the kernel refuses, without harm
     with suppress(OSError):  # /proc may be hidden
         for begin, end in _heaps():
             for page in range(-(-begin // huge) * huge, end - huge + 1, huge):
@@ -28,9 +28,9 @@ def settle() -> None:
 
 
 def give_back() -> None:
-    """Return free pages to the system, also between used ones; the heap keeps them otherwise.
+    """Return free pages to the system, also between used ones; otherwise the heap keeps them.
 
-    About a millisecond for 200 MB; nothing where the C library cannot (it is glibc's ``malloc_trim``).
+    Takes about a millisecond for 200 MB; no effect without glibc's ``malloc_trim``.
     """
     trim = getattr(_LIBRARY, "malloc_trim", None)
     if trim is not None:
@@ -38,7 +38,7 @@ def give_back() -> None:
 
 
 def _heaps() -> Iterator[tuple[int, int]]:
-    """Address ranges of the C library's and Python's own memory."""
+    """Address ranges of the heaps of the C library and of Python."""
     for line in Path("/proc/self/maps").read_text().splitlines():
         span, rights, _, _, _, *name = line.split()
         if rights.startswith("rw") and name in ([], ["[heap]"]):

@@ -1,4 +1,4 @@
-"""An animated GIF that is written picture by picture, however long it gets."""
+"""Animated GIF, written frame by frame with bounded memory."""
 
 from contextlib import ExitStack
 from io import BufferedWriter
@@ -11,18 +11,18 @@ from PIL import GifImagePlugin, Image, ImageChops
 from monstertruck_runtime.small_files import whole_file
 
 LONGEST_FRAME: Final = 65_535
-"""Maximum display time of a picture, hundredths of a second (GIF89a, 23: 16 bits)."""
+"""Maximum display time of a frame, hundredths of a second (GIF89a, 23: 16 bits)."""
 
 
 class MovingPicture:
-    """Writes a GIF, as a whole or not at all; a context manager.
+    """Writes a GIF atomically; a context manager.
 
-    Only the latest picture is kept, and the differences between pictures.
+    Keeps only the latest frame and the differences between frames.
 
     Args:
-        file: takes the place of an older one at the end; without a picture there is none.
-        seconds: display time of a picture.
-        rest: display time of the last one; None for that of the others.
+        file: file to write, replaced at the end; without a frame no file is written.
+        seconds: display time of a frame.
+        rest: display time of the last frame; None: as the others.
     """
 
     def __init__(self, file: Path, seconds: float, rest: float | None = None) -> None:
@@ -34,9 +34,9 @@ class MovingPicture:
         self._palette = b""
         self._newest: Image.Image | None = None
         self._waiting: tuple[Image.Image, tuple[int, int], int] | None = None
-        """Part of a picture, its place, and how long it stands, hundredths of a second."""
+        """Part of a frame, its position, and its display time, hundredths of a second."""
         self.count = 0
-        """Pictures so far, those that look like the one before too."""
+        """Number of frames so far, including repeated ones."""
 
     def __enter__(self) -> Self:
         return self
@@ -50,7 +50,7 @@ class MovingPicture:
             self._made.__exit__(kind, error, trace)
 
     def add(self, picture: Image.Image) -> None:
-        """Add a picture with a palette.
+        """Add a frame with a palette.
 
         Raises:
             OSError: it cannot be written.
@@ -71,7 +71,7 @@ class MovingPicture:
         self._newest, self._waiting = picture, (part, place, self._shown)
 
     def close(self) -> None:
-        """Write the last picture and the end of the file.
+        """Write the last frame and the end of the file.
 
         Raises:
             OSError: it cannot be written.
@@ -91,7 +91,7 @@ class MovingPicture:
         if self._out is None:
             self._out = self._made.enter_context(self._made.enter_context(whole_file(self._file)).open("wb"))
             self._palette = palette
-            # Of a copy: it changes its picture.
+            # On a copy, because it modifies its image.
             self._out.writelines(GifImagePlugin.getheader(part.copy(), info={"loop": 0, "optimize": False})[0])
         own = palette != self._palette
         self._out.writelines(

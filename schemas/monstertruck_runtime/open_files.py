@@ -1,4 +1,4 @@
-"""Processes of this computer that have a file, device or socket open, by the kernel's tables."""
+"""Processes of this computer that have a file, device or socket open, from the kernel's tables."""
 
 from collections.abc import Collection, Iterator
 from contextlib import suppress
@@ -9,15 +9,17 @@ PROC: Final = Path("/proc")
 
 
 def holders(targets: Collection[str], proc: Path = PROC) -> Iterator[str]:
-    """Describe the processes that have one of ``targets`` open, by number and command line. Blocks for milliseconds.
+    """Describe the processes that have one of ``targets`` open, by process id and command line.
+
+    Blocks for milliseconds.
 
     Args:
-        targets: as links in ``/proc/PID/fd`` name them: ``/dev/ttyUSB0``, ``socket:[4711]``.
+        targets: targets in the format of links in ``/proc/PID/fd``: ``/dev/ttyUSB0``, ``socket:[4711]``.
         proc: the kernel's tables.
 
     Yields:
-        For example ``process 4711 (monstertruckd run --config demo.yaml)``. Processes of other users are found only by
-        root.
+        For example ``process 4711 (monstertruckd run --config demo.yaml)``. Only root sees the processes of other
+        users.
     """
     wanted = frozenset(targets)
     for folder in sorted(proc.glob("[0-9]*"), key=lambda folder: int(folder.name)):
@@ -26,7 +28,7 @@ def holders(targets: Collection[str], proc: Path = PROC) -> Iterator[str]:
 
 
 def _open_files(folder: Path) -> Iterator[str]:
-    """Open files of a process; none if it belongs to another user, or has ended."""
+    """Open files of a process; empty if it belongs to another user or has ended."""
     with suppress(OSError):
         for link in (folder / "fd").iterdir():
             with suppress(OSError):  # closed meanwhile
@@ -38,4 +40,4 @@ def _command_line(folder: Path) -> str:
         words = (folder / "cmdline").read_bytes().decode(errors="replace").split("\0")
     except OSError:
         return "ended"
-    return " ".join(words).strip()[:160]  # characters of a command line that are shown
+    return " ".join(words).strip()[:160]  # maximum number of command-line characters shown

@@ -1,8 +1,8 @@
-"""The door for files from outside: maps, pictures, arrays, tables, logs, certificates, files of earlier runs.
+"""Reading of external files: maps, images, arrays, tables, logs, certificates, files of earlier runs.
 
-A reader opens its file with one of the functions here, or does its work in ``reading``. Any failure then, in any
-library, becomes one of our refusals, which names the file, the expectation and the finding. Sizes are bounded before
-anything is decompressed or held.
+A reader opens its file with one of the functions here, or works inside ``reading``. Every failure in any library is
+then converted to one of our errors, which names the file, the expected content and the finding. Sizes are bounded
+before anything is decompressed or loaded.
 """
 
 import gzip
@@ -25,21 +25,21 @@ if TYPE_CHECKING:
     from PIL import Image
 
 MOST_UNPACKED: Final = 128 * MEGABYTE
-"""Bytes that a compressed file, or a compressed part of one, may hold."""
+"""Maximum size of a compressed file or compressed part, decompressed (bytes)."""
 MOST_PIXELS: Final = 25 * MEGABYTE
-"""Pixels of a picture: 250 m x 250 m in cells of 5 cm."""
+"""Maximum pixels of an image: 250 m x 250 m in cells of 5 cm."""
 FORMATS: Final = ("PNG", "PPM", "BMP", "JPEG", "TIFF", "GIF", "WEBP")
 """Formats of pictures that are read; Pillow decodes others by starting programs."""
 
 
 @contextmanager
 def reading(file: Path | str, expected: str, refusal: type[TruckError] = InputError) -> Iterator[None]:
-    """Turn any exception of the body into a refusal of ``file``; our own errors pass.
+    """Convert any exception in the body to an error about ``file``; our own errors pass unchanged.
 
     Args:
-        file: path, or path and place in it, as the user is to see it.
+        file: path, or path and place in it, for the message.
         expected: expected content, e.g. "a pose graph".
-        refusal: class of the refusal.
+        refusal: class of the error.
     """
     try:
         yield
@@ -59,11 +59,11 @@ def quoted(text: str) -> str:
 
 
 def cause_of(error: BaseException) -> str:
-    """Return one line about an error of a library."""
+    """Format an error of a library as one line."""
     if isinstance(error, ValidationError):
         return first_mistake(error)
     if isinstance(error, MemoryError):
-        return "it needs more memory than there is"
+        return "there is not enough memory for it"
     if isinstance(error, RecursionError):
         return "it is nested too deeply"
     text = quoted(str(error))
@@ -76,7 +76,7 @@ def contents(file: Path, expected: str, most: int, refusal: type[TruckError] = I
     """Read a whole file of at most ``most`` bytes.
 
     Raises:
-        TruckError: ``refusal``: it cannot be read, is not a regular file, or is longer.
+        TruckError: ``refusal``: it cannot be read, is not a regular file, or is too large.
     """
     with reading(file, expected, refusal):
         require_file(file, most)
@@ -97,7 +97,7 @@ def text_from(data: bytes, file: Path, expected: str, refusal: type[TruckError] 
     """Decode the content of ``file``: UTF-8, with or without a byte order mark.
 
     Raises:
-        TruckError: ``refusal``: it is not UTF-8; names the line.
+        TruckError: ``refusal``: it is not UTF-8; the message names the line.
     """
     try:
         return data.decode("utf-8-sig")
@@ -110,7 +110,7 @@ def lines_of(file: Path, expected: str, most: int = MOST_UNPACKED) -> Iterator[s
     """Yield the lines of a text file, unpacked if its name ends with ``.gz``.
 
     Raises:
-        InputError: it cannot be read, is not UTF-8, is damaged, or holds more than ``most`` bytes.
+        InputError: it cannot be read, is not UTF-8, is damaged, or contains more than ``most`` bytes.
     """
     with reading(file, expected):
         require_file(file)
@@ -134,7 +134,7 @@ def arrays(
     """Read all arrays of an npz file, by name.
 
     Raises:
-        TruckError: ``refusal``: it cannot be read, is damaged, holds objects, or more than ``most`` bytes.
+        TruckError: ``refusal``: it cannot be read, is damaged, contains objects, or more than ``most`` bytes.
     """
     with reading(file, expected, refusal):
         require_file(file)
@@ -154,10 +154,10 @@ def arrays(
 
 
 def _require_array(stream: Any, size: int) -> None:
-    """Refuse the head of an array that does not fit into ``size`` bytes: NumPy would make room for it.
+    """Reject the header of an array that does not fit into ``size`` bytes, for which NumPy would allocate memory.
 
     Raises:
-        ValueError: it is not an array, holds objects, or is too large.
+        ValueError: it is not an array, contains objects, or is too large.
     """
     version = np.lib.format.read_magic(stream)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0

@@ -1,7 +1,7 @@
-"""Path files: our table, racelines and centrelines of F1TENTH and TUM, waypoints of Nav2, paths of ROS.
+"""Path files: our table format, racelines and centrelines of F1TENTH and TUM, waypoints of Nav2, paths of ROS.
 
-Points are metres. Headings of racelines are not read: TUM counts them from the y axis, F1TENTH from the x axis, under
-the same name (``psi_rad``). The path's own direction replaces them.
+Points are in metres. Headings of racelines are not read, because TUM measures them from the y axis and F1TENTH from the
+x axis, under the same name (``psi_rad``). The direction of the path replaces them.
 """
 
 import math
@@ -31,33 +31,33 @@ COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
     "y": ("y", "y_m"),
     "speed": ("speed", "speed_mps", "v", "v_mps", "vx", "vx_mps", "vx_racetraj_mps", "velocity"),
 }
-"""Names of a column in files of others."""
+"""Names of a column in the formats of other programs."""
 _SHIFTED: Final = ("x_ref_m", "y_ref_m", "x_normvec_m", "y_normvec_m", "alpha_m")
 """TUM's trajectory for a local planner: reference line, its normals, and the shift along them."""
 EXPECTED: Final = "a path"
 LARGEST_PATH_FILE: Final = 10_000_000
-"""Size of a file of poses at most: a hundred thousand and more."""
+"""Maximum size of a file of poses: more than a hundred thousand."""
 SPACING: Final = 0.05
 """Distance between the poses of a curve through waypoints, m."""
 
 
 def names_of(columns: str | None) -> tuple[str, ...]:
-    """Return the names in a list with commas."""
+    """Split a comma-separated list of names."""
     return tuple(columns.split(",")) if columns else ()
 
 
 def path_from(text: str, file: FilePath, *, closed: bool, frame: str = "odom", columns: Sequence[str] = ()) -> Path:
-    """Read a path from a file's text; whether it can be tracked is not checked.
+    """Parse a path; whether the robot can track it is not checked.
 
     Args:
         text: text of the file.
-        file: its name; the suffix tells table from YAML.
-        closed: the path is a lap.
+        file: file name; its suffix distinguishes table and YAML.
+        closed: whether the path is a lap.
         frame: frame of its poses.
-        columns: names of a table's columns, which replace those in the file.
+        columns: column names of a table, which replace those in the file.
 
     Raises:
-        InputError: naming file, line and expectation.
+        InputError: invalid content; the message names file, line and expected content.
     """
     if _is_yaml(file):
         rows, curved = _waypoints(text, file)
@@ -89,7 +89,8 @@ def mission_from(text: str, file: FilePath) -> Mission:
     """Return a mission that drives to each waypoint of a file.
 
     Raises:
-        InputError: it has none, more than a mission has steps, or something else; names the first mistake.
+        InputError: it contains no waypoints, more than a mission may have, or other content; the message names the
+            first error.
     """
     poses, _ = _waypoints(text, file)
     steps = [{"do": "goto", "x": x, "y": y, "yaw": yaw} for x, y, yaw in poses.tolist()]
@@ -99,16 +100,16 @@ def mission_from(text: str, file: FilePath) -> Mission:
 
 
 def path_text(path: Path, form: PathForm, *, speed: float | None = None, width: float | None = None) -> str:
-    """Return a path as a file's text.
+    """Format a path as the text of a file.
 
     Args:
-        path: what to write.
-        form: format of the file.
-        speed: speed of a raceline whose path sets no speeds, m/s.
-        width: width of the track on each side of a centreline, m.
+        path: path to write.
+        form: file format.
+        speed: speed for a raceline if the path has no speeds, m/s.
+        width: free width on each side of a centreline, m.
 
     Raises:
-        InputError: the form needs a speed or width, or cannot hold motion backward.
+        InputError: the format needs a speed or width, or does not support backward motion.
     """
     poses = path.poses.reshape(-1, 3)
     directions = path.directions if len(path.directions) else np.ones(len(poses))
@@ -143,7 +144,7 @@ def _lines(head: str, columns: Sequence[Array], delimiter: str) -> str:
 
 
 def _waypoint(x: float, y: float, yaw: float) -> dict[str, list[float]]:
-    """A pose as Nav2's panel in RViz writes it: position, and quaternion w, x, y, z."""
+    """A pose in the format of Nav2's RViz panel: position, and quaternion w, x, y, z."""
     return {"pose": [x, y, 0.0], "orientation": [math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]}
 
 
@@ -178,7 +179,7 @@ def _table(text: str, file: FilePath, columns: Sequence[str], *, closed: bool) -
 
 
 def _require(right: NDArray[np.bool_], what: str, file: FilePath, rows: list[tuple[int, list[str]]]) -> None:
-    """Refuse the first row that is not right."""
+    """Report the first invalid row."""
     if not right.all():
         line, cells = rows[int(np.argmin(right))]
         raise InputError(f"{file}:{line}: expected {what}, found {quoted(','.join(cells))}")
@@ -196,7 +197,10 @@ def _column(file: FilePath, rows: list[tuple[int, list[str]]], found: Mapping[st
 
 
 def _names(text: str, rows: list[tuple[int, list[str]]], columns: Sequence[str]) -> tuple[list[str], int]:
-    """Names of the columns, and how many rows they take: given, in the first row, or in the last comment before it."""
+    """Column names, and the number of rows they occupy.
+
+    From the caller, the first row, or the last comment before it.
+    """
     first, cells = rows[0]
     if columns:
         return [name.strip().lower() for name in columns], 0 if _is_number(cells[0]) else 1
@@ -243,7 +247,7 @@ def _headings(points: Array, *, closed: bool) -> Array:
 
 
 def _waypoints(text: str, file: FilePath) -> tuple[Array, bool]:
-    """Poses of a YAML file, and whether they are waypoints, far apart, rather than a path."""
+    """Poses in a YAML file, and whether they are waypoints (far apart) rather than a path."""
     # `ros2 topic echo` ends each message with a line of dashes.
     documents = [part for part in text.removeprefix("\ufeff").split("\n---") if part.strip("- \n")]
     with reading(file, "waypoints"):
@@ -269,7 +273,7 @@ def _mapping(value: Any) -> Mapping[str, Any]:
 
 
 def _pose(row: Any, where: str) -> tuple[float, float, float]:
-    """A waypoint in any of the known forms."""
+    """A waypoint in any of the supported forms."""
     row = _mapping(row)
     if "latitude" in row:
         raise InputError(f"{where}: has a latitude: expected metres in the map")

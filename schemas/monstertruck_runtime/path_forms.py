@@ -1,4 +1,4 @@
-"""Names of the file formats of paths; light, for the command line."""
+"""Names of the path file formats, without heavy imports, for the command line."""
 
 from enum import StrEnum
 

@@ -1,4 +1,4 @@
-"""Values as JSON carries them."""
+"""JSON-compatible values."""
 
 import math
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ def plain(value: Any) -> Any:
     """Return a JSON-compatible copy: models and enums become plain, non-finite numbers become None.
 
     Args:
-        value: built of mappings, sequences, models, scalars.
+        value: value of mappings, sequences, models and scalars.
     """
     match value:
         case BaseModel():

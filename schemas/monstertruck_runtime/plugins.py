@@ -1,8 +1,8 @@
 """Plug-ins: implementations of each ``kind`` in the configuration, from this repository or another distribution.
 
-A catalog has one ``Plugin`` per kind. The settings model is light: it is loaded to check a configuration. The
-implementation is loaded on use, so that listing kinds, ``--help`` and a check of a configuration stay cheap. Other
-distributions add rows through entry points that name a ``Plugin``::
+A catalog has one ``Plugin`` per kind. The settings model is loaded to check a configuration and must be light. The
+implementation is loaded on use, so that listing kinds, ``--help`` and checking a configuration stay fast. Other
+distributions add rows through entry points that refer to a ``Plugin``::
 
     [project.entry-points."monstertruck.trackers"]
     mine = "my_package.plugin:MINE"
@@ -27,10 +27,10 @@ from monstertruck_schemas.entry_points import ExtensibleTable
 
 
 def load(place: str) -> Any:
-    """The object at ``module:name``.
+    """Load the object at ``module:name``.
 
     Raises:
-        ImportError: there is no such module, or it needs one that is not installed.
+        ImportError: the module does not exist, or needs one that is not installed.
         AttributeError: the module has no such name.
     """
     module, _, name = place.partition(":")
@@ -39,16 +39,16 @@ def load(place: str) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Plugin:
-    """One kind of something that a configuration can choose; a catalog may use a subclass with more columns."""
+    """One kind that a configuration can choose; a catalog may use a subclass with more columns."""
 
     name: str
-    """The ``kind`` in a configuration."""
+    """Value of ``kind`` in a configuration."""
     settings: str
     """Place ``module:Class`` of its settings, a ``Schema`` with ``kind: Literal[name]``."""
     implementation: str
     """Place ``module:Class`` of the implementation; the catalog's user defines its arguments."""
     doc: str
-    """One line for lists."""
+    """Description in one line, for lists."""
     extra: str | None = None
     """Extra of the distribution without which the implementation does not load."""
 
@@ -60,7 +60,7 @@ class Plugin:
         """Implementation; loads its module.
 
         Raises:
-            InputError: it does not load, or is no class.
+            InputError: it does not load, or is not a class.
         """
         return self.callable_at(self.implementation)
 
@@ -68,7 +68,7 @@ class Plugin:
         """Return an instance of the implementation.
 
         Raises:
-            InputError: it does not load, or takes other arguments.
+            InputError: it does not load, or has other arguments.
         """
         return self.called(self.implementation, *arguments, **named)
 
@@ -83,7 +83,7 @@ class Plugin:
         except (ImportError, AttributeError) as error:
             needs = "" if self.extra is None else f"needs the extra [{self.extra}]: "
             raise InputError(f"kind {self.name}: {place}: {needs}{error}") from error
-        except (Exception, SystemExit) as error:  # whatever the plug-in's module does
+        except (Exception, SystemExit) as error:  # any exception of the plug-in's module
             raise InputError(f"kind {self.name}: {place}: {type(error).__name__}: {error}") from error
         if not callable(found):
             raise InputError(f"kind {self.name}: {place}: expected a class or a function, found {found!r}")
@@ -93,7 +93,7 @@ class Plugin:
         """Call the class or function at ``module:name``.
 
         Raises:
-            InputError: see ``callable_at``; or it takes other arguments.
+            InputError: see ``callable_at``; or it has other arguments.
         """
         make = self.callable_at(place)
         try:
@@ -107,10 +107,10 @@ class Plugin:
 
     @contextmanager
     def refusing(self, place: str) -> Iterator[None]:
-        """Context of calls into the plug-in's code: its mistakes are refused with their place.
+        """Context for calls into a plug-in's code: converts its exceptions to errors that name their place.
 
         Raises:
-            InputError: the code raises something else than our errors.
+            InputError: the code raised an exception other than our errors.
         """
         try:
             yield
@@ -123,7 +123,7 @@ class Plugin:
             raise InputError(f"kind {self.name}: {place}: {text}") from error
 
     def default_settings(self) -> Schema:
-        """Settings without any key from a configuration.
+        """Settings with all defaults.
 
         Raises:
             InputError: a field has no default.
@@ -140,14 +140,14 @@ P = TypeVar("P", bound=Plugin)
 
 
 class Catalog(ExtensibleTable[P], Generic[P]):
-    """All plug-ins of one group by kind: ours in the order given, then plug-ins of other distributions.
+    """All plug-ins of one group by kind: built-in ones in the given order, then those of other distributions.
 
-    Settings models of other distributions are loaded with their entry points, ours on first use.
+    Settings models of other distributions are loaded with their entry points, built-in ones on first use.
 
     Args:
         group: group of the entry points.
-        rows: ours; their class is what other distributions have to give.
-        base: of the settings models.
+        rows: built-in rows; other distributions must provide the same class.
+        base: base class of the settings models.
     """
 
     def __init__(self, group: str, *rows: P, base: type[Schema] = Schema) -> None:
@@ -155,7 +155,7 @@ class Catalog(ExtensibleTable[P], Generic[P]):
         self._base, self._row_class = base, type(rows[0])
 
     def fault(self, row: Any) -> str | None:
-        """Fault of a row of another distribution."""
+        """Error in a row of another distribution."""
         if not isinstance(row, self._row_class):
             return f"expected a {self._row_class.__name__}, found {type(row).__name__}"
         model: Any = row.settings_class()
@@ -171,20 +171,20 @@ class Catalog(ExtensibleTable[P], Generic[P]):
         return {name: row.settings_class() for name, row in self.items()}
 
     def find(self, name: str) -> P:
-        """The row of a kind.
+        """Return the row of a kind.
 
         Raises:
-            InputError: there is none.
+            InputError: the kind is unknown.
         """
         if name not in self:
             raise InputError(f"{self.group}: no kind {name!r}: expected one of {', '.join(self)}")
         return self[name]
 
     def implementation(self, config: Schema) -> Any:
-        """The implementation for settings of one of the kinds.
+        """Return the implementation for settings of one of the kinds.
 
         Raises:
-            InputError: no such kind, or it does not load.
+            InputError: unknown kind, or it does not load.
         """
         return self.find(str(vars(config).get("kind"))).implementation_class()
 
@@ -192,22 +192,22 @@ class Catalog(ExtensibleTable[P], Generic[P]):
         """Return an instance of the implementation for settings of one of the kinds.
 
         Args:
-            config: The settings.
-            arguments: For the implementation, the settings included.
-            named: Likewise.
+            config: settings.
+            arguments: positional arguments of the implementation, including the settings.
+            named: keyword arguments.
 
         Raises:
-            InputError: no such kind, or the implementation does not load or takes other arguments.
+            InputError: unknown kind, or the implementation does not load or has other arguments.
         """
         return self.find(str(vars(config).get("kind"))).build(*arguments, **named)
 
     def section(self, default: str | None = None) -> "KindSection":
-        """Annotation of a configuration field that holds the settings of one of the kinds.
+        """Annotation of a configuration field that contains the settings of one of the kinds.
 
         For instance ``tracker: Annotated[TrackerConfig, TRACKERS.section()]``.
 
         Args:
-            default: kind of a section that names none; None if it is required.
+            default: kind of a section without ``kind``; None if it is required.
         """
         return KindSection(self, default)
 
@@ -250,7 +250,7 @@ def wrong_default(model: type[BaseModel], place: str) -> str | None:
 
 
 def kind_of(model: type[BaseModel]) -> str | None:
-    """The only kind that a settings model belongs to; None for other models."""
+    """The single kind of a settings model; None for other models."""
     field = model.model_fields.get("kind")
     if field is None or get_origin(field.annotation) is not Literal:
         return None
@@ -259,7 +259,7 @@ def kind_of(model: type[BaseModel]) -> str | None:
 
 
 def classes_in(annotation: Any) -> Iterator[type[Any]]:
-    """All classes an annotation names, the settings models of catalogs included."""
+    """All classes in an annotation, including the settings models of catalogs."""
     if isinstance(annotation, KindSection):
         yield from annotation.models
     elif isinstance(annotation, type):
@@ -269,7 +269,7 @@ def classes_in(annotation: Any) -> Iterator[type[Any]]:
 
 
 def models_in(field: FieldInfo) -> Iterator[type[BaseModel]]:
-    """All models that a field of a model may hold."""
+    """All models that a field of a model may contain."""
     for annotation in (field.annotation, *field.metadata):
         for cls in classes_in(annotation):
             if issubclass(cls, BaseModel):

@@ -1,4 +1,4 @@
-"""The narrow interfaces services see of the rest: publish, subscribe, report."""
+"""Interfaces between services and the rest of the daemon: publish, subscribe, report."""
 
 from collections.abc import Awaitable, Callable
 from typing import Any, Protocol, TypeVar, runtime_checkable
@@ -24,7 +24,7 @@ class Publisher(Protocol[M_contra]):
         """Sequence number for the next message of this topic."""
 
     def put(self, message: M_contra) -> None:
-        """Hand the message to every subscriber; never blocks."""
+        """Deliver the message to every subscriber; never blocks."""
 
 
 class Subscription(Protocol[M_co]):
@@ -32,18 +32,18 @@ class Subscription(Protocol[M_co]):
 
     @property
     def latest(self) -> M_co | None:
-        """Latest message, or None before the first; reading it consumes nothing."""
+        """Latest message, or None before the first; reading it does not consume it."""
 
     async def next(self) -> M_co:
         """Wait for a message not returned by ``next`` yet."""
 
     async def next_within(self, seconds: float, take: Callable[[M_co], bool] | None = None) -> M_co | None:
-        """The same, or None if nothing comes in that time.
+        """Wait as ``next`` does; return None if no message arrives within the timeout.
 
         Args:
-            seconds: limit.
-            take: gets a message that comes during the wait at once, in its writer's own callback; if it returns True
-                the wait continues, and the message counts as read.
+            seconds: timeout, s.
+            take: called immediately with a message that arrives during the wait, in its writer's callback; if it
+                returns True the wait continues, and the message counts as read.
         """
 
 
@@ -58,14 +58,14 @@ class BusPort(Protocol):
     """The bus, for plug-ins that choose their topics themselves."""
 
     def publisher(self, topic: Topic[M], writer: Writer) -> Publisher[M]:
-        """The one write end of ``topic``.
+        """The only write end of ``topic``.
 
         Raises:
-            RuntimeError: ``writer`` is not the topic's writer, or the write end is taken.
+            RuntimeError: ``writer`` is not the topic's writer, or the write end is already in use.
         """
 
     def subscribe(self, topic: Topic[M], delivery: Delivery) -> Mailbox[M]:
-        """A read end of ``topic``; for a retained topic it holds the latest message at once."""
+        """A read end of ``topic``; for a retained topic it contains the latest message at once."""
 
     def event_sink(self) -> EventSink:
         """Sink of events."""
@@ -75,7 +75,9 @@ Ready = Callable[[], None]
 """Called by a service once its session works; resets the restart budget."""
 
 Handler = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
-"""Serves a remote call: gets the caller's JSON object, returns the answer; refuses by raising ``TruckError``."""
+"""Handler of a remote call: receives the caller's JSON object, returns the answer; refuses by raising
+``TruckError``.
+"""
 
 
 class RpcRegistry(Protocol):
@@ -84,9 +86,9 @@ class RpcRegistry(Protocol):
     def register(
         self, name: str, handler: Handler, role: AccessRole = AccessRole.PILOT, *, recorded: bool = True
     ) -> None:
-        """Serve ``name`` by ``handler`` for callers that have ``role``, or one that may do more.
+        """Serve ``name`` by ``handler`` for callers with ``role`` or a more powerful role.
 
-        Calls that only read, or come many times a second, are not ``recorded``.
+        Calls that only read, or arrive many times a second, are not ``recorded``.
         """
 
 
@@ -95,4 +97,4 @@ class ServesCalls(Protocol):
     """A service that serves remote calls."""
 
     def register(self, rpc: RpcRegistry) -> None:
-        """Serve its calls by ``rpc``."""
+        """Register its calls with ``rpc``."""

@@ -1,4 +1,4 @@
-"""Waiting for a robot's later message, while the robot may restart or fall silent, or a service may fail."""
+"""Waiting for a later message of a robot that may restart or fall silent, or whose service may fail."""
 
 import asyncio
 from collections.abc import Awaitable
@@ -15,7 +15,7 @@ from monstertruck_schemas.topics import GATE, HEALTH
 T = TypeVar("T")
 
 GONE: Final = 2.0
-"""Maximum gap in the state of the gate, sent ten times a second, before a driving client gives up (s)."""
+"""Maximum gap in the gate state, sent ten times a second, before a driving client gives up (s)."""
 
 
 class Subscriber(Protocol):
@@ -26,12 +26,12 @@ class Subscriber(Protocol):
 
 
 async def while_it_runs(robot: Subscriber, work: Awaitable[T], needs: ServiceName) -> T:
-    """The result of ``work``, which waits for a message of the service ``needs`` of the robot's current run.
+    """Result of ``work``, which waits for a message of the service ``needs`` of the robot's current run.
 
     Raises:
-        RequestRefusedError: the service failed, or the robot restarted: its new run knows nothing of it.
-        NoAnswerError: it has been silent for 60 s.
-        Exception: what ``work`` raised.
+        RequestRefusedError: the service failed, or the robot restarted, so the new run does not know the request.
+        NoAnswerError: the robot has been silent for 60 s.
+        Exception: raised by ``work``.
     """
     working = asyncio.ensure_future(work)
     with robot.subscribe(GATE, latest()) as gate, robot.subscribe(HEALTH, latest()) as health:
@@ -47,8 +47,8 @@ async def while_it_runs(robot: Subscriber, work: Awaitable[T], needs: ServiceNam
 
 async def _until_gone(gate: Mailbox[GateState], health: Mailbox[HealthTable], needs: ServiceName) -> NoReturn:
     run: str | None = None
-    # Maximum gap in it before a waiting client gives up: links that are lost for shorter come back, and the
-    # robot drives on by itself meanwhile.
+    # Maximum gap before a waiting client gives up: shorter losses of the link recover, and the robot continues by
+    # itself meanwhile.
     lost = 60.0
     while (state := await gate.next_within(lost)) is not None:
         run = run or state.nonce

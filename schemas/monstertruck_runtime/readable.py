@@ -1,4 +1,4 @@
-"""Waiting for input that others share: a terminal is one open file of the shell, the screen and every program."""
+"""Waiting for input on a shared file: the shell, the screen and every program share the terminal's open file."""
 
 import asyncio
 import os
@@ -6,12 +6,12 @@ from collections.abc import Callable
 
 
 def when_readable(fd: int, callback: Callable[[], object]) -> None:
-    """Have the loop call back, and leave the mode of ``fd`` alone.
+    """Call back when ``fd`` is readable, without changing its mode.
 
-    uvloop makes it non-blocking, forever, and with it the screen and whatever else shares the open terminal.
+    uvloop makes it non-blocking permanently, which affects the screen and all other users of the terminal.
 
     Raises:
-        PermissionError: it is a file.
+        PermissionError: it is a regular file.
     """
     blocking = os.get_blocking(fd)
     try:

@@ -1,6 +1,6 @@
-"""Requests from outside: parsing, authentication by nonce, sequence, freshness and role, and who sends orders.
+"""External requests: parsing, authentication by nonce, sequence, freshness and role; and clients that send orders.
 
-The gate and the planners check requests by the same rules, whether they come by topic or by remote call.
+The gate and the planners check requests by the same rules, whether sent by topic or by remote call.
 """
 
 import json
@@ -24,17 +24,17 @@ M = TypeVar("M", bound=Message)
 R = TypeVar("R", bound=Request)
 
 OPERATORS: Final = frozenset({Role.HAND, Role.GAMEPAD, Role.KEYBOARD, Role.STATION})
-"""Roles of human operators: may arm and reset."""
+"""Roles of human operators, who may arm and reset."""
 
 MAX_SOURCES: Final = 64
-"""Sources kept for each kind of request; the least recent one is dropped for a new one."""
+"""Maximum number of sources for each kind of request; a new one replaces the least recent one."""
 
 MAX_PROGRAMS: Final = 16
-"""How many of them may be of one owner: the names of programs can be invented."""
+"""Maximum number of sources per owner, because a client can invent program names."""
 
 
 class Operator(Protocol):
-    """Client of one robot that gives orders."""
+    """Client of one robot that sends orders."""
 
     source: str
 
@@ -42,47 +42,47 @@ class Operator(Protocol):
         """Subscribe to a topic."""
 
     async def call(self, rpc: str, payload: dict[str, Any] | None = None) -> dict[str, Any]:
-        """Call ``rpc`` with a JSON object; returns its answer."""
+        """Call ``rpc`` with a JSON object; return its answer."""
 
     async def header(self, lease: float = 1.0) -> dict[str, Any]:
         """Header of the next request, as plain data."""
 
     def order(self, order: Order, *, hold: bool = False, calibrates: bool = False) -> Coroutine[Any, Any, GateState]:
-        """Give an order; the coroutine waits until it is carried out and returns the gate's state then.
+        """Send an order and wait until it is carried out; return the resulting gate state.
 
         Args:
-            order: what.
-            hold: of an order to arm: planners do not drive until the truck is armed without it.
-            calibrates: of an order to arm: see ``ControlRequest``.
+            order: order to send.
+            hold: with an order to arm: planners do not drive until the truck is armed without it.
+            calibrates: with an order to arm: see ``ControlRequest``.
 
         Raises:
             RequestRefusedError: refused; carries the reason.
             NoAnswerError: no answer in time.
-            NotFoundError: the robot is not there.
+            NotFoundError: no such robot.
         """
 
     async def arm(self, *, hold: bool = False, calibrates: bool = False) -> GateState:
-        """Allow driving, unless ``hold`` by planners too; answered once armed. Raises as ``order`` does."""
+        """Allow driving, with ``hold`` except by planners; answered once armed. Raises the errors of ``order``."""
         return await self.order(Order.ARM, hold=hold, calibrates=calibrates)
 
     async def disarm(self) -> GateState:
-        """Stop and forbid driving; answered once disarmed. Raises as ``order`` does."""
+        """Stop and forbid driving; answered once disarmed. Raises the errors of ``order``."""
         return await self.order(Order.DISARM)
 
     async def estop(self) -> GateState:
-        """Emergency stop, latched; answered once latched. Raises as ``order`` does."""
+        """Emergency stop, latched; answered once latched. Raises the errors of ``order``."""
         return await self.order(Order.ESTOP)
 
     async def reset(self) -> GateState:
-        """Clear the emergency stop; answered once disarmed. Raises as ``order`` does."""
+        """Clear the emergency stop; answered once disarmed. Raises the errors of ``order``."""
         return await self.order(Order.RESET)
 
     async def stop(self) -> GateState:
-        """Stop driving by the ordinary ramp; answered once at rest. Raises as ``order`` does."""
+        """Stop driving by the ordinary ramp; answered once at rest. Raises the errors of ``order``."""
         return await self.order(Order.STOP)
 
     async def drive_shafts(self, *rates: float, lease: float = 0.3) -> None:
-        """Request the rate of the wheels on every driven shaft, rad/s, for ``lease`` seconds."""
+        """Request the wheel rate of every driven shaft, rad/s, for ``lease`` seconds."""
 
     async def behave(
         self,
@@ -92,18 +92,18 @@ class Operator(Protocol):
         *,
         own: bool = False,
     ) -> dict[str, Any]:
-        """Start a configured behaviour, or stop it; answers with its ``number``. Progress is on ``plan/behaviour``.
+        """Start a configured behaviour, or stop it; return its ``number``. ``plan/behaviour`` publishes the progress.
 
         Args:
-            order: what.
-            behaviour: its name.
-            settings: those that replace the configured ones for this run.
-            own: of a stop: only one that this client started.
+            order: start or stop.
+            behaviour: name of the behaviour.
+            settings: settings that replace the configured ones for this run.
+            own: with a stop: only a behaviour started by this client.
 
         Raises:
-            RequestRefusedError: why it does not start, or nothing runs.
-            InputError: a setting is wrong.
-            NotFoundError: the robot is not there, or has no such behaviour.
+            RequestRefusedError: it does not start, or none is running; carries the reason.
+            InputError: a setting is invalid.
+            NotFoundError: no such robot or behaviour.
             NoAnswerError: no answer in time.
         """
         request = {"order": order, "behaviour": behaviour, "own": own}
@@ -112,18 +112,18 @@ class Operator(Protocol):
 
 
 def parse_request(model: type[R], payload: dict[str, Any]) -> R:
-    """The request a remote call carries.
+    """Parse the request in a remote call.
 
     Args:
-        model: its kind.
+        model: model of the request.
         payload: JSON object.
 
     Raises:
         RequestRefusedError: a number is not finite.
-        InputError: the request is invalid; the text names the first wrong field.
+        InputError: the request is invalid; the text names the first invalid field.
     """
     try:
-        return model.model_validate_json(json.dumps(payload), extra="ignore")  # a newer client may say more
+        return model.model_validate_json(json.dumps(payload), extra="ignore")  # a newer client may send more fields
     except ValidationError as error:
         text = first_mistake(error)
         if error.errors(include_url=False)[0]["type"] == "finite_number":
@@ -138,14 +138,14 @@ def register_numbered(
     take: Callable[[R], int],
     kept: Callable[[], Awaitable[object]] | None = None,
 ) -> None:
-    """Serve ``name``, whose payload is a ``model``; the answer is the ``number`` that ``take`` returns.
+    """Serve ``name``, whose payload is a ``model``; the answer is the ``number`` returned by ``take``.
 
     Args:
         rpc: registry of remote calls.
         name: name of the call.
         model: model of its payload.
         take: carries out the request.
-        kept: returns once the request outlasts a power cut; the call is answered then. None if nothing is kept.
+        kept: returns once the request survives a power cut; the call is answered then. None if nothing is saved.
     """
 
     async def call(payload: dict[str, Any]) -> dict[str, Any]:
@@ -158,29 +158,29 @@ def register_numbered(
 
 
 class Sequences:
-    """Latest sequence number of each source of one kind of requests.
+    """Latest sequence number of each source for one kind of request.
 
-    A number counts only while a request may be on its way, for an older one is refused for its gate stamp: so a number
-    of 2^62 under another source's name does not lock that source out.
+    A number is remembered only while an older request could still arrive; after that the request's gate stamp is too
+    old. So a number of 2^62 sent under another source's name does not block that source permanently.
 
     Args:
-        max_age: greatest age of a request's gate stamp, s.
+        max_age: maximum age of a request's gate stamp, s.
     """
 
     def __init__(self, max_age: float = math.inf) -> None:
         self._memory = max(max_age, 2.0) * SECOND  # minimum seconds that a sequence number is remembered
         self._newest: dict[str, tuple[int, int]] = {}
-        """Number, and when it was accepted, ns."""
+        """Number, and time of its acceptance, ns."""
 
     def accept(self, request: Request, nonce: str, now: int, keep: Collection[str] = ()) -> Reason:
-        """OK, or why the request does not belong to this run; an accepted sequence number is not accepted again.
+        """Return OK, or why the request does not belong to this run; an accepted sequence number is not accepted again.
 
         Args:
-            request: what was asked.
+            request: request to check.
             nonce: required nonce.
             now: ns.
-            keep: sources whose lease runs. They are not dropped (if they take all places, a new one is refused), and
-                their numbers make no leaps.
+            keep: sources with a valid lease. They are not dropped (if they use all places, a new one is refused), and
+                their numbers may not jump.
         """
         source = request.source
         if request.nonce != nonce:
@@ -188,7 +188,7 @@ class Sequences:
         newest, at = self._newest.get(source, (-1, 0))
         if request.seq <= newest and now - at <= self._memory:
             return Reason.BAD_SEQUENCE
-        # 2**32: greatest step of a source's numbers while its lease runs: nanoseconds may be counted
+        # 2**32: maximum step of a source's numbers during its lease, which may be nanoseconds
         if source in keep and source in self._newest and abs(request.seq - newest) > 2**32:
             return Reason.BUSY
         if source not in self._newest and (crowd := crowded(self._newest, source)):
@@ -206,7 +206,7 @@ def crowded(known: Collection[str], source: str) -> Collection[str]:
 
     Args:
         known: names of sources.
-        source: the new one.
+        source: new source.
     """
     programs = [name for name in known if owner_of(name) == owner_of(source)]
     if len(programs) >= MAX_PROGRAMS:
@@ -215,26 +215,26 @@ def crowded(known: Collection[str], source: str) -> Collection[str]:
 
 
 def freshness(request: Request, now: int, limit: float) -> Reason:
-    """OK, or LEASE_EXPIRED for a request whose gate stamp is missing or older than ``limit`` s."""
+    """Return OK, or LEASE_EXPIRED for a request whose gate stamp is missing or older than ``limit`` s."""
     known = request.gate_stamp
     return Reason.OK if known is not None and 0 <= now - known <= limit * SECOND else Reason.LEASE_EXPIRED
 
 
 def late_text(limit: float) -> str:
-    """Why ``freshness`` refuses a request."""
+    """Message for a request that ``freshness`` refuses."""
     return f"the request came more than {limit:g} s after its sender had heard the gate: the link or a computer is slow"
 
 
 def planner_request(seq: int, gate: GateState, now: int, source: str, lease: float, **motion: Any) -> DriveRequest:
-    """A planner's drive request to the gate with the latest state ``gate``.
+    """Create a planner's drive request to the gate with the latest state ``gate``.
 
     Args:
         seq: sequence number of the publisher.
-        gate: its nonce and stamp authenticate the request.
+        gate: state whose nonce and stamp authenticate the request.
         now: ns.
-        source: the planner.
-        lease: s.
-        motion: fields of the request that say which.
+        source: name of the planner.
+        lease: lease, s.
+        motion: fields of the request that describe the motion.
     """
     return DriveRequest(
         stamp=now,
@@ -253,10 +253,10 @@ def inner_request(seq: int, gate: GateState | None, now: int, source: str) -> di
     """Header of a request from one service of the robot to another, in place of an operator.
 
     Args:
-        seq: grows from request to request.
-        gate: newest state of the gate.
+        seq: increases from request to request.
+        gate: latest state of the gate.
         now: ns.
-        source: the service.
+        source: name of the service.
     """
     return {
         "stamp": now,
@@ -271,17 +271,17 @@ def inner_request(seq: int, gate: GateState | None, now: int, source: str) -> di
 
 
 def examine(request: Request, gate: GateState | None, sequences: Sequences, now: int, max_age: float | None) -> None:
-    """Refuse a request to the planners by the rules of driving.
+    """Refuse a request to the planners that violates the rules of driving.
 
     Args:
-        request: what was asked.
-        gate: newest state of the gate.
-        sequences: sequences of this kind of requests.
+        request: request to check.
+        gate: latest state of the gate.
+        sequences: sequences of this kind of request.
         now: ns.
-        max_age: greatest age of its gate stamp, s; None for a request that moves nothing.
+        max_age: maximum age of its gate stamp, s; None for a request that moves nothing.
 
     Raises:
-        RequestRefusedError: the sender may not ask for that, or it is too old.
+        RequestRefusedError: the sender lacks the permission, or the request is too old.
     """
     reason = Reason.BAD_NONCE if gate is None else sequences.accept(request, gate.nonce, now)
     if reason is Reason.OK and max_age is not None:
@@ -295,7 +295,7 @@ def examine(request: Request, gate: GateState | None, sequences: Sequences, now:
 
 
 def does_not_drive(gate: GateState | None) -> RequestRefusedError:
-    """Answer to a request for motion while the robot is not armed: main reason, and why in words."""
+    """Refusal of a request for motion while the robot is not armed: main reason and message."""
     if gate is None:
         return RequestRefusedError(Reason.DISARMED, f"the robot does not drive: {Reason.DISARMED.text}")
     return RequestRefusedError(gate.worst, f"the robot does not drive: {gate.why}")

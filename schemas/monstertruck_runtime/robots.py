@@ -1,4 +1,4 @@
-"""Robots that answer on this computer, to choose one if no endpoint is given."""
+"""Robots that answer on this computer; used to choose one if no endpoint is given."""
 
 import json
 from collections.abc import Callable
@@ -8,7 +8,7 @@ from monstertruck_runtime.errors import InputError
 
 
 def robots_at(endpoint: str, timeout: float = 0.5) -> list[str]:  # timeout of a liveliness query (s)
-    """Names of the robots that answer at an endpoint; empty if nothing does, or if it requires a certificate."""
+    """Names of the robots that answer at an endpoint; empty if none does, or if it requires a certificate."""
     import zenoh  # noqa: PLC0415 - takes longer than a command's other work, and is rarely needed
 
     from monstertruck_runtime.stations import session_config  # noqa: PLC0415
@@ -42,10 +42,11 @@ def only_robot(name: str | None, choice: Callable[[str, str], str]) -> str:
 
     Args:
         name: name of the robot; None if it is not given either.
-        choice: describes the choice of a robot, by its name and endpoint.
+        choice: text that describes how to choose a robot, from its name and endpoint.
 
     Raises:
-        InputError: several robots could be meant, or none answers at the default port; lists those that answer.
+        InputError: several robots are possible, or none answers at the default port; the message lists those that
+            answer.
     """
     default = nearest(DEFAULT_ENDPOINT)
     endpoints = local_endpoints()

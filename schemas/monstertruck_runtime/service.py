@@ -32,8 +32,9 @@ from monstertruck_schemas.reasons import Reason
 log = logging.getLogger(__name__)
 
 _ENDING: Final[WeakSet[asyncio.Task[None]]] = WeakSet()
-"""Services that their scope ends. ``Task.cancelling`` may count one too many: in Python 3.11 a ``TaskGroup`` leaves one
-behind whose member fails while the group waits for its members."""
+"""Services ended by their scope. ``Task.cancelling`` may count one too many: in Python 3.11 a ``TaskGroup`` leaves one
+behind if a member fails while the group waits for its members.
+"""
 
 
 class Service(Protocol):
@@ -46,16 +47,16 @@ class Service(Protocol):
 
 
 class OnBug(StrEnum):
-    """Effect of an unexpected exception in a service."""
+    """Consequence of an unexpected exception in a service."""
 
     EXIT = "exit"
-    """Gate, actuators, bridge to Zenoh: the process must end."""
+    """For gate, actuators and the bridge to Zenoh: the process must end."""
     FAIL = "fail"
-    """Any other: stop the truck through the gate, fail this service alone."""
+    """For all others: stop the truck through the gate and fail only this service."""
 
 
 class RestartPolicy(Schema):
-    """When a lost session is tried again."""
+    """When to retry a lost session."""
 
     first_delay: Annotated[float, Field(ge=0)] = 0.1
     """Seconds before the first retry."""
@@ -64,11 +65,11 @@ class RestartPolicy(Schema):
     max_delay: Annotated[float, Field(gt=0)] = 1.0
     """Maximum time between two attempts (s): a replugged device is back within this time."""
     jitter: Annotated[float, Field(ge=0, le=0.5)] = 0.1
-    """Share of the delay that is drawn at random, so that devices of one hub do not start together."""
+    """Random fraction of the delay, so that devices of one hub do not start together."""
     settled_after: Annotated[float, Field(ge=0)] = 5.0
     """Working time that resets the delay (s)."""
     budget: Annotated[int, Field(ge=1)] | None = None
-    """Restarts allowed within ``window`` seconds before the service is given up; None for no limit."""
+    """Number of restarts allowed within ``window`` seconds before the service fails; None: unlimited."""
     window: Annotated[float, Field(gt=0)] = 60.0
     """Time in which ``budget`` is counted (s)."""
 
@@ -84,18 +85,18 @@ async def supervise(
     rng: np.random.Generator,
     on_bug: OnBug = OnBug.FAIL,
 ) -> None:
-    """Run ``service`` again and again by ``policy`` until cancelled, reporting its health.
+    """Run ``service`` repeatedly by ``policy`` until cancelled, reporting its health.
 
-    A session that is lost while its scope ends is not tried again. A service that returns, or ends by another task's
-    cancellation, is as much a bug as an unexpected exception.
+    A session lost while its scope ends is not retried. A service that returns, or ends by another task's cancellation,
+    is a bug, just as an unexpected exception.
 
     Args:
-        service: what to run.
+        service: service to run.
         policy: delays and budget.
-        clock: time.
-        report: gets a row whenever the state changes.
+        clock: source of time.
+        report: called with a row whenever the state changes.
         rng: source of the jitter.
-        on_bug: whether an exception outside the error tree is raised or fails this service alone.
+        on_bug: whether an exception outside the error tree is raised or only fails this service.
 
     Raises:
         RuntimeError: a bug, when ``on_bug`` is ``EXIT``.
@@ -127,7 +128,7 @@ async def supervise(
             return
 
         if isinstance(lost, PortBusyError) and on_bug is OnBug.EXIT and session.starts == 1:
-            # Two daemons must not compete for each other's actuators.
+            # Two daemons must not compete for the same actuators.
             session.report_state(ServiceState.FAILED, lost.reason, str(lost))
             raise PortBusyError(f"{service.name}: {lost}")
         detail = str(lost) or type(lost).__name__
@@ -144,13 +145,13 @@ async def supervise(
         if session.ready_at is not None and now - session.ready_at >= policy.settled_after * SECOND:
             delay = policy.first_delay
         session.report_state(ServiceState.BACKOFF, lost.reason, detail)
-        del lost  # its traceback holds all of the session, and this very frame
+        del lost  # its traceback refers to the whole session, and to this frame
         await clock.sleep(delay * (1 + policy.jitter * float(rng.uniform(-1, 1))))
         delay = min(delay * policy.factor, policy.max_delay)
 
 
 async def _serve(service: Service, ready: Ready) -> None:
-    """One session; a loss while its scope ends it does not take the cancellation's place."""
+    """Run one session; a loss while its scope ends does not replace the cancellation."""
     try:
         await service.run(ready)
     except TruckError as error:
@@ -161,7 +162,7 @@ async def _serve(service: Service, ready: Ready) -> None:
 
 
 def _asked_to_end() -> bool:
-    """Whether it is this task that was cancelled, not something it waited for."""
+    """Whether this task itself was cancelled, not one that it waited for."""
     task = asyncio.current_task()
     return task is not None and task.cancelling() > 0
 
@@ -176,7 +177,7 @@ class _Session:
         self.starts = 0
         self.ready_at: int | None = None
         self._warned: set[Reason] = set()
-        """Causes of the current outage that were logged as warnings."""
+        """Causes of the current outage already logged as warnings."""
 
     def start(self) -> None:
         self.starts += 1
@@ -191,7 +192,7 @@ class _Session:
             log.info("%s: ready", self._name)
 
     def log_loss(self, reason: Reason, detail: str) -> None:
-        """The first loss of an outage is a warning, and one of another cause; repetitions are not."""
+        """Log the first loss of an outage, and every new cause, as a warning; repetitions with a lower level."""
         log.log(logging.DEBUG if reason in self._warned else logging.WARNING, "%s: %s", self._name, detail)
         self._warned.add(reason)
 
@@ -209,7 +210,7 @@ class _Session:
 
 
 class Scope:
-    """Services that live and end together; made by ``scope``."""
+    """Services that live and end together; created by ``scope``."""
 
     def __init__(self, name: str) -> None:
         owner = asyncio.current_task()
@@ -228,10 +229,10 @@ class Scope:
         self._tasks.append(task)
 
     async def end(self) -> bool:
-        """End all services, latest first and each completely, even if the owner is cancelled meanwhile.
+        """End all services, latest first, one at a time, even if the owner is cancelled meanwhile.
 
         Returns:
-            True if the owner was cancelled meanwhile by another task, which must still be informed.
+            True if another task cancelled the owner meanwhile; the cancellation must still be delivered.
         """
         self._ending = True
         disturbed = False

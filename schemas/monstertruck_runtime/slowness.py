@@ -1,12 +1,12 @@
-"""Slower computers on the virtual clock: a run takes the processor time of a slower computer.
+"""Slow computers on the virtual clock: a run takes as much time as on a slower computer.
 
-The processor time of each turn of a service's tasks is measured, and the virtual time advances by it times a factor:
-timers that are due meanwhile fire late, as on that computer. A worker's result is delivered after its declared latency
-times the factor, or after its measured processor time times the factor, whichever is longer; each worker has its own
-processor. Such runs depend on this computer's speed and are not reproducible. Without a factor nothing is measured, and
-runs are reproducible.
+The processor time of every turn of a service's tasks is measured, and virtual time advances by this time multiplied by
+a factor: timers due meanwhile fire late, as on that computer. A worker's result is delivered after its declared latency
+or its measured processor time, whichever is longer, multiplied by the factor; each worker has its own processor. Such
+runs depend on the speed of this computer and are not reproducible. Without a factor no time is measured, and runs are
+reproducible.
 
-Callbacks that belong to no task of a service (the links' bytes, the world) take no such time.
+Callbacks outside of service tasks (bytes of the links, the world) take no time.
 """
 
 import asyncio
@@ -30,7 +30,7 @@ _module: ContextVar[str | None] = ContextVar("module", default=None)
 
 
 def factor_of(slowness: float | Board) -> float:
-    """The factor of a number, or of a named board."""
+    """Factor as a number, or of a named board."""
     return slowness if isinstance(slowness, float) else BOARDS[slowness]
 
 
@@ -38,28 +38,28 @@ class SlowComputer:
     """A computer with cores ``factor`` times slower than this one.
 
     Args:
-        clock: clock whose time is moved on; at most one slow computer per clock.
-        factor: how much slower it is.
+        clock: clock whose time advances; at most one slow computer per clock.
+        factor: ratio of the computing times.
     """
 
     def __init__(self, clock: VirtualClock, factor: float) -> None:
         self.factor = factor
         self.turns: dict[str, list[float]] = {}
-        """Processor time of this computer, s, of every turn of every service, and of every step of every worker."""
+        """Processor time on this computer (s) of every turn of every service, and of every step of every worker."""
         self._clock = clock
         _computers[clock] = self
         asyncio.get_running_loop().set_task_factory(self._task)
 
     def service(self, name: str, work: Coroutine[Any, Any, T]) -> Coroutine[Any, Any, T]:
-        """``work`` as the service ``name``, to be run by a task; the tasks that it creates belong to it."""
+        """Wrap ``work`` as the service ``name``, to be run by a task; tasks that it creates belong to the service."""
         return _Measured(work, name, self)
 
     def note(self, name: str, used: float) -> None:
-        """Remember processor time, s, that needs not be waited for by others."""
+        """Record processor time (s) for which no other task has to wait."""
         self.turns.setdefault(name, []).append(used)
 
     def charge(self, name: str, used: float) -> None:
-        """Remember processor time, s, of the loop, and let as much time pass as the slow computer takes for it."""
+        """Record processor time (s) of the loop, and advance the virtual time by its duration on the slow computer."""
         self.note(name, used)
         self._clock.spend(used * self.factor)
 
@@ -72,12 +72,12 @@ _computers: WeakKeyDictionary[Clock, SlowComputer] = WeakKeyDictionary()
 
 
 def slow_computer(clock: Clock) -> SlowComputer | None:
-    """The computer that a clock simulates; None = this one, at its own speed."""
+    """Computer simulated by a clock; None: this one, at full speed."""
     return _computers.get(clock)
 
 
 class _Measured(Coroutine[Any, Any, T]):
-    """A coroutine whose every turn is measured."""
+    """Coroutine whose turns are measured."""
 
     def __init__(self, work: Coroutine[Any, Any, T], name: str, computer: SlowComputer) -> None:
         self._work = work
@@ -85,21 +85,21 @@ class _Measured(Coroutine[Any, Any, T]):
         self._computer = computer
 
     def send(self, value: Any) -> Any:
-        """One turn."""
+        """Run one turn."""
         _module.set(self._name)
         return self._turn(self._work.send, value)
 
     def throw(self, *error: Any) -> Any:
-        """One turn that begins with an exception."""
+        """Run one turn that starts with an exception."""
         _module.set(self._name)
         return self._turn(self._work.throw, *error)
 
     def close(self) -> None:
-        """End it where it waits."""
+        """End it at its current wait."""
         self._work.close()
 
     def __await__(self) -> Generator[Any, Any, T]:
-        """Tasks alone take it, by ``send`` and ``throw``."""
+        """Only tasks drive it, by ``send`` and ``throw``."""
         raise NotImplementedError
 
     def _turn(self, go_on: Callable[..., Any], *arguments: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Small files: in /proc and /sys, where they may be missing, and files that are replaced as a whole."""
+"""Small files: files in /proc and /sys, which may be missing, and files that are replaced atomically."""
 
 import errno
 import fcntl
@@ -13,14 +13,14 @@ from typing import Final
 
 MEGABYTE: Final = 1_000_000
 SCRATCH: Final = ".new~"
-"""End of the names of files that are being written; of a killed writer they are left."""
+"""Suffix of files being written; killed writers leave such files behind."""
 
 DAMAGED: Final = ".damaged"
-"""Appended to the name of a file that is kept for what may still be read of it."""
+"""Suffix of a damaged file that is kept for inspection."""
 
 
 def text_of(file: Path) -> str | None:
-    """Content without the white space around it; None if it is not there or cannot be read."""
+    """Content without surrounding white space; None if the file is missing or cannot be read."""
     try:
         return file.read_text(encoding="utf-8", errors="backslashreplace").strip()
     except OSError:
@@ -28,7 +28,7 @@ def text_of(file: Path) -> str | None:
 
 
 def number_of(file: Path) -> int | None:
-    """Content as a decimal number; None where ``text_of`` gives none or something else."""
+    """Content as a decimal number; None if ``text_of`` returns None or no number."""
     text = text_of(file)
     try:
         return None if text is None else int(text)
@@ -37,14 +37,14 @@ def number_of(file: Path) -> int | None:
 
 
 def require_file(path: Path, most: int | None = None) -> None:
-    """Refuse what would take forever, or too much memory, to read.
+    """Reject a file that would block or use too much memory when read.
 
     Args:
-        path: to be read.
-        most: bytes it may have; None = any number.
+        path: file to read.
+        most: maximum size, bytes; None: unlimited.
 
     Raises:
-        OSError: nothing is there, it is a folder, a pipe or a device, or is longer than ``most``.
+        OSError: the file is missing, is a folder, a pipe or a device, or is larger than ``most``.
     """
     status = path.stat()
     if stat.S_ISDIR(status.st_mode):
@@ -56,10 +56,10 @@ def require_file(path: Path, most: int | None = None) -> None:
 
 
 def require_place(path: Path) -> None:
-    """Refuse a file that cannot be written, before the work whose result it is to hold.
+    """Reject an output file that cannot be written, before the work for its content.
 
     Raises:
-        OSError: its folder is not there or cannot be written to, or it is a folder itself.
+        OSError: its folder is missing or not writable, or it is a folder itself.
     """
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
@@ -70,18 +70,19 @@ def require_place(path: Path) -> None:
 
 
 def replace_file(path: Path, content: str | bytes, mode: int = 0o644, *, follow_links: bool = True) -> None:
-    """Give the file its ``content``, as a whole or not at all; an existing file keeps its mode.
+    """Replace the ``content`` of a file atomically; an existing file keeps its mode.
 
-    File and folder are synced: once this returns, the content outlasts a power cut.
+    File and folder are synced: when this returns, the content survives a power cut.
 
     Args:
         path: the file, or a link to it.
         content: new content; text becomes UTF-8.
         mode: mode of a new file.
-        follow_links: a link stays one and its file gets the content; otherwise the file takes the link's place.
+        follow_links: whether to keep a link and write its target; otherwise the file replaces the link.
 
     Raises:
-        OSError: it could not be written, or is a folder, a device or the like; the file is the old or the new one.
+        OSError: it could not be written, or is a folder, a device or the like; the file has either the old or the new
+            content.
     """
     place = path.resolve() if follow_links else path
     before = place.lstat().st_mode if os.path.lexists(place) else None
@@ -99,10 +100,10 @@ def replace_file(path: Path, content: str | bytes, mode: int = 0o644, *, follow_
 
 
 def remove_file(path: Path) -> None:
-    """Remove a file, if it is there; once this returns, it stays away after a power cut.
+    """Remove a file if it exists; when this returns, the removal survives a power cut.
 
     Raises:
-        OSError: it could not be removed; it may be gone until the next power cut.
+        OSError: it could not be removed; it may reappear after the next power cut.
     """
     path.unlink(missing_ok=True)
     if path.parent.exists():
@@ -110,13 +111,13 @@ def remove_file(path: Path) -> None:
 
 
 def damaged_names(path: Path) -> Iterator[Path]:
-    """Names under which damaged files of this name are kept: NAME.damaged, NAME.damaged-2 and so on."""
+    """Names for damaged files of this name: NAME.damaged, NAME.damaged-2 and so on."""
     for number in itertools.count(1):
         yield path.with_name(path.name + DAMAGED + (f"-{number}" if number > 1 else ""))
 
 
 def put_aside(path: Path) -> str:
-    """Rename a damaged file to the first free one of ``damaged_names``; returns words about where it is kept."""
+    """Rename a damaged file to the first free one of ``damaged_names``; return a text with its new name."""
     try:
         kept = next(name for name in damaged_names(path) if not os.path.lexists(name))
         path.rename(kept)
@@ -127,10 +128,10 @@ def put_aside(path: Path) -> str:
 
 
 def make_folder(path: Path, mode: int = 0o777) -> None:
-    """Make a folder of this ``mode`` and those above it, where they are missing, and sync the names of the new ones.
+    """Create a folder of this ``mode`` and its missing parents, and sync the new names.
 
     Raises:
-        OSError: one could not be made.
+        OSError: one could not be created.
     """
     missing = [folder for folder in (path, *path.parents) if not folder.exists()]
     path.mkdir(mode, parents=True, exist_ok=True)
@@ -139,7 +140,7 @@ def make_folder(path: Path, mode: int = 0o777) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Write the names in a folder to the disk: a new or renamed file is safe only after this.
+    """Sync a folder: only then is a new or renamed file in it safe.
 
     Raises:
         OSError: the disk failed.
@@ -155,13 +156,13 @@ def sync_folder(folder: Path) -> None:
 
 
 def remove_leftovers(folder: Path) -> list[Path]:
-    """Remove leftovers of killed writers from a folder; files that are being written stay.
+    """Remove leftovers of killed writers from a folder; files being written are kept.
 
     Returns:
         The files that were removed.
 
     Raises:
-        OSError: the folder cannot be read, or a file not be removed.
+        OSError: the folder cannot be read, or a file cannot be removed.
     """
     removed = []
     for path in sorted(folder.glob(f"*{SCRATCH}")) if folder.is_dir() else ():
@@ -185,7 +186,7 @@ def remove_leftovers(folder: Path) -> list[Path]:
 
 @contextmanager
 def _scratch(place: Path) -> Iterator[tuple[int, Path]]:
-    """Yield a new, locked file next to ``place`` and its path; if it is not renamed, it is removed at the end."""
+    """Yield a new, locked file next to ``place`` and its path; unless renamed, it is removed at the end."""
     while True:
         handle, name = tempfile.mkstemp(dir=place.parent, prefix=f"{place.name}.", suffix=SCRATCH)
         scratch = Path(name)
@@ -204,10 +205,10 @@ def _scratch(place: Path) -> Iterator[tuple[int, Path]]:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield where to write a file of any length: ``.part`` behind its name, which it takes once the body ends.
+    """Yield a path for writing a file of any size: its name with ``.part``, renamed when the context ends.
 
-    If the body fails, its output is removed, and an existing file of that name stays. File and folder are synced.
-    A system error without a file name, as for a full disk, is given this name.
+    If the body fails, its output is removed, and an existing file of that name is kept. File and folder are synced. A
+    system error without a file name, such as for a full disk, gets this name.
 
     Raises:
         OSError: ``path`` is a folder, a device or the like, or cannot be replaced.

@@ -1,4 +1,4 @@
-"""Why a robot does not drive: the gate's state gives the current reason, events and stops its cause."""
+"""Why a robot does not drive: the current reason from the gate's state, its cause from events and stops."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,7 +14,7 @@ from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_schemas.topics import EVENT, GATE, STOP
 
 BEGINS: Final = frozenset({Reason.ARMED, Reason.DRIVING})
-"""Events that end an earlier reason to stand."""
+"""Events that end an earlier reason for standing still."""
 HELD: Final = frozenset({Reason.DISARMED, Reason.ESTOPPED})
 """Reasons without a cause."""
 ENDS: Final = frozenset({Reason.DISARMED, Reason.FAULTS_REPEAT})
@@ -35,14 +35,15 @@ class StandstillMonitor:
         self._stops = stops
         self._events = events
         self._since: int | None = None
-        """Time of the last arming or start of driving, or when it was first seen armed, ns of its clock; None if
-        never."""
+        """Time of the last arming or start of driving, or when the client first saw it armed, ns of its clock; None if
+        never.
+        """
         self._said: list[str] = []
 
     def why(self) -> str:
         """Why the gate does not let the robot drive, with the cause of a disarm if known; empty if it does.
 
-        Call it now and then while the robot drives, too.
+        Call it regularly, also while the robot drives.
         """
         held = self.gate.latest
         self._take()
@@ -64,7 +65,7 @@ class StandstillMonitor:
         return "; ".join(dict.fromkeys(said))
 
     def _after_it_began(self, stop: Stop) -> bool:
-        """Whether it ended the latest driving: before an obstacle the robot stands, but its driver stays."""
+        """Whether it ended the latest drive: in front of an obstacle the robot stands, but its driver keeps control."""
         return self._since is not None and stop.stamp >= self._since and not stop.mode.accepts_motion
 
     def _take(self) -> None:
@@ -84,7 +85,7 @@ def _causes(stop: Stop) -> str:
 
 @contextmanager
 def monitor_standstill(robot: Subscriber) -> Iterator[StandstillMonitor]:
-    """Follow a robot through its ``subscribe`` while the context lasts."""
+    """Follow a robot through its ``subscribe`` for the duration of the context."""
     with (
         robot.subscribe(GATE, latest()) as gate,
         robot.subscribe(STOP, latest()) as stops,

@@ -1,6 +1,6 @@
-"""Sessions of stations: the configuration of Zenoh, certificates and names of sources.
+"""Sessions of stations: Zenoh configuration, certificates and names of sources.
 
-Nothing heavy is imported here: an emergency stop is sent before the rest of the program is loaded.
+This module has no heavy imports, so that an emergency stop can be sent before the rest of the program is loaded.
 """
 
 import getpass
@@ -18,12 +18,12 @@ from monstertruck_runtime.endpoints import host_of, port_of
 from monstertruck_runtime.errors import NotFoundError, NotPermittedError
 
 TLS_VARIABLE: Final = "MONSTERTRUCKD_TLS"
-"""Names the folder of the station's certificate."""
+"""Environment variable with the folder of the station's certificate."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClientTls:
-    """Files of a station with its own certificate."""
+    """Certificate files of a station."""
 
     ca: Path
     """Certificate of the authority that signed the robot's certificate"""
@@ -34,7 +34,7 @@ class ClientTls:
         """Common name of the certificate.
 
         Raises:
-            InputError: the file holds no certificate with one.
+            InputError: the file contains no certificate with a common name.
         """
         from cryptography import x509  # noqa: PLC0415 - only for certificates
         from cryptography.x509.oid import NameOID  # noqa: PLC0415
@@ -55,7 +55,7 @@ def station_tls(environment: Mapping[str, str] = os.environ) -> ClientTls:
 
     Raises:
         NotFoundError: a file is missing.
-        NotPermittedError: others may read the key.
+        NotPermittedError: other users may read the key.
     """
     home = Path(environment.get("XDG_CONFIG_HOME") or Path.home() / ".config")
     folder = Path(environment.get(TLS_VARIABLE) or home / "monstertruckd" / "tls")
@@ -69,12 +69,12 @@ def station_tls(environment: Mapping[str, str] = os.environ) -> ClientTls:
 
 
 def session_config(endpoint: str, timeout: float, tls: ClientTls | None) -> dict[str, Any]:
-    """Configuration of a Zenoh session that dials one endpoint, and neither listens nor discovers.
+    """Configuration of a Zenoh session that connects to one endpoint, and neither listens nor discovers.
 
     Args:
         endpoint: endpoint of the robot.
-        timeout: for the link, s.
-        tls: for ``tls/...`` endpoints.
+        timeout: timeout for the link, s.
+        tls: certificate files for ``tls/...`` endpoints.
     """
     config: dict[str, Any] = {
         "mode": "client",
@@ -95,13 +95,13 @@ def session_config(endpoint: str, timeout: float, tls: ClientTls | None) -> dict
 
 
 def link_refusal(endpoint: str, ca: Path, tls: ClientTls | None, timeout: float) -> str:
-    """Why this or the other side refuses a ``tls/...`` link, which Zenoh does not report; empty if it is accepted.
+    """Why either side rejects a ``tls/...`` link, which Zenoh does not report; empty if it is accepted.
 
     Args:
         endpoint: endpoint of the robot.
         ca: certificate of the robot's authority.
-        tls: certificate of this station, or None.
-        timeout: seconds for each step.
+        tls: certificate of this station, if any.
+        timeout: timeout of each step, s.
 
     Raises:
         OSError: no process listens there, or the files cannot be used.
@@ -116,7 +116,7 @@ def link_refusal(endpoint: str, ca: Path, tls: ClientTls | None, timeout: float)
             socket.create_connection((host_of(endpoint), port_of(endpoint) or 0), timeout) as raw,
             context.wrap_socket(raw, server_hostname=host_of(endpoint)) as link,
         ):
-            link.recv(1)  # in TLS 1.3 the robot judges the certificate after the handshake
+            link.recv(1)  # in TLS 1.3 the robot checks the certificate after the handshake
     except TimeoutError:
         return ""
     except ssl.SSLError as error:
@@ -125,31 +125,31 @@ def link_refusal(endpoint: str, ca: Path, tls: ClientTls | None, timeout: float)
 
 
 def require_certificates(endpoint: str, tls: ClientTls | None) -> None:
-    """Say so if there is no link because a certificate is refused.
+    """Raise an error if the link fails because a certificate is rejected.
 
     Raises:
-        NotPermittedError: one is.
+        NotPermittedError: a certificate is rejected.
     """
     if tls is None:
         return
     with suppress(OSError):
-        # 1.0: seconds for a step of a handshake that is to say why there is no link
+        # 1.0: timeout of a step of the diagnostic handshake (s)
         if why := link_refusal(endpoint, tls.ca, tls, 1.0):
             text = "its certificate or this station's is refused"
             raise NotPermittedError(f"{endpoint}: {text}: {why} (`monstertruckd security show` lists dates)")
 
 
 def own_source(owner: str | None = None, program: str = "") -> str:
-    """Name of this program in requests: of the certificate's owner, or of the user, with host and process number.
+    """Name of this program in requests: the certificate's owner or the user, with host and process id.
 
     Args:
-        owner: common name of the certificate, which is kept whole.
-        program: distinguishes several of one process. A long name loses the end of the host first, then the beginning
-            of the program.
+        owner: common name of the certificate, never shortened.
+        program: distinguishes several programs of one process. A long name is shortened at the end of the host, then at
+            the start of the program.
     """
     end = f"{os.getpid()}{'-' * bool(program)}{program}"
     host = _plain(socket.gethostname())
-    longest_source = 64  # characters of a source's name
+    longest_source = 64  # maximum length of a source's name
     if owner is not None:
         room = longest_source - len(owner) - 1
         return f"{owner}:{host[: max(room - len(end) - 1, 0)]}-{end[-max(room - 1, 0) :]}"[:longest_source]
@@ -161,10 +161,10 @@ def own_source(owner: str | None = None, program: str = "") -> str:
 
 
 def tls_for(endpoint: str) -> ClientTls | None:
-    """The certificate of this user's station for an endpoint that needs one. Raises as ``station_tls`` does."""
+    """Certificate of this user's station, for an endpoint that needs one. Raises the errors of ``station_tls``."""
     return station_tls() if endpoint.startswith("tls/") else None
 
 
 def _plain(name: str) -> str:
-    """What of a name may be in a key."""
+    """Remove characters not allowed in a key."""
     return re.sub(r"[^A-Za-z0-9_.-]", "-", name)

@@ -1,4 +1,4 @@
-"""Why the truck was stopped, in words: for gate, command line and stations."""
+"""Description of why the truck stopped, for gate, command line and stations."""
 
 from collections.abc import Iterator, Sequence
 
@@ -11,7 +11,7 @@ def causes_text(causes: Sequence[Cause], now: int) -> str:
 
     Args:
         causes: as in ``Stop``.
-        now: instant the durations count to, ns.
+        now: time up to which durations are measured, ns.
     """
     return "; ".join(
         ", because ".join(cause_text(cause, now) for cause in chain(causes, head)) for head in heads(causes)
@@ -19,10 +19,10 @@ def causes_text(causes: Sequence[Cause], now: int) -> str:
 
 
 def stop_lines(stop: Stop, now: int) -> list[str]:
-    """The stop in a few lines: what and when, then the causes, each indented below its effect.
+    """Describe the stop in a few lines: the stop and its time, then the causes, each indented below its effect.
 
     Args:
-        stop: the latest message of its number.
+        stop: latest message with its number.
         now: the robot's time, ns, e.g. the stamp of its latest gate state.
     """
     how = "quick stop" if stop.quick else "stop"
@@ -38,13 +38,13 @@ def stop_lines(stop: Stop, now: int) -> list[str]:
 
 
 def heads(causes: Sequence[Cause]) -> list[Cause]:
-    """Causes that tripped the gate directly: causes of no other cause."""
+    """Causes that directly tripped the gate: causes of no other cause."""
     deeper = {cause.because for cause in causes}
     return [cause for index, cause in enumerate(causes) if index not in deeper]
 
 
 def chain(causes: Sequence[Cause], head: Cause) -> Iterator[Cause]:
-    """``head`` and its causes, link by link; indices that lead nowhere or back end it."""
+    """``head`` and its causes, link by link; an invalid or repeated index ends the chain."""
     left = len(causes)
     cause = head
     while True:
@@ -56,7 +56,7 @@ def chain(causes: Sequence[Cause], head: Cause) -> Iterator[Cause]:
 
 
 def cause_text(cause: Cause, now: int) -> str:
-    """One cause: ``no fresh lidar scan (for 10 ms, age 260 ms, limit 250 ms)``."""
+    """Describe one cause: ``no fresh lidar scan (for 10 ms, age 260 ms, limit 250 ms)``."""
     lasted = (now - cause.since) / SECOND
     notes = [f"for {duration_text(lasted)}"] if lasted >= 1e-3 else []
     notes += [measurement_text(measurement) for measurement in cause.measurements]
@@ -64,7 +64,7 @@ def cause_text(cause: Cause, now: int) -> str:
 
 
 def measurement_text(measurement: Measurement) -> str:
-    """One measurement with its limit and, where it is not the age itself, its age."""
+    """Describe one measurement with its limit and, unless it is an age itself, its age."""
     text = f"{measurement.name} {_quantity_text(measurement.value, measurement.unit)}"
     if measurement.limit is not None:
         text += f", limit {_quantity_text(measurement.limit, measurement.unit)}"
@@ -72,7 +72,7 @@ def measurement_text(measurement: Measurement) -> str:
 
 
 def duration_text(seconds: float) -> str:
-    """A duration: ms below a second, then s, then minutes."""
+    """Format a duration: ms below a second, then s, then minutes."""
     if seconds < 1.0:
         return f"{seconds * 1e3:.0f} ms"
     return f"{seconds:.1f} s" if seconds < 100 else f"{seconds / 60:.0f} min"

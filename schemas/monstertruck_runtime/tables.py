@@ -11,13 +11,14 @@ COMMENT: Final = "#"
 
 
 def read_table(file: Path, expected: str, most: int) -> list[tuple[int, list[str]]]:
-    """Read a table of at most ``most`` bytes: each row's line and its cells, without white space around them.
+    """Read a table of at most ``most`` bytes: line number and cells of each row, without surrounding white space.
 
-    A byte order mark, empty lines and lines that begin with ``#`` are left out. The delimiter is the one of comma,
-    semicolon and tab that the first row has most of.
+    A byte order mark, empty lines and lines that start with ``#`` are skipped. The delimiter is the most frequent of
+    comma, semicolon and tab in the first row.
 
     Raises:
-        InputError: it cannot be read, is too long, is not UTF-8, or not a table; names the line if there is one.
+        InputError: it cannot be read, is too large, is not UTF-8, or not a table; the message names the line if
+            possible.
     """
     return rows_of(text_of(file, expected, most), file, expected)
 
@@ -26,7 +27,7 @@ def rows_of(text: str, file: Path, expected: str) -> list[tuple[int, list[str]]]
     """Return the rows of a table's text; see ``read_table``.
 
     Raises:
-        InputError: it is not a table; names the line.
+        InputError: it is not a table; the message names the line.
     """
     rows = [(number, line) for number, line in enumerate(text.splitlines(), start=1) if _counts(line)]
     delimiter = max(DELIMITERS, key=rows[0][1].count) if rows else DELIMITERS[0]

@@ -1,4 +1,4 @@
-"""Between the event loop and threads: blocking work off the loop, and the hop back onto it."""
+"""Transitions between the event loop and threads: blocking work off the loop, and calls back onto it."""
 
 import asyncio
 import threading
@@ -13,14 +13,14 @@ T = TypeVar("T")
 
 
 class ThreadHop(Generic[T]):
-    """Bounded queue from any thread to one loop, which takes one item per turn: a burst never delays other callbacks.
+    """Bounded queue from any thread to one loop, which delivers one item per iteration, so bursts delay no callbacks.
 
     Args:
         deliver: called on the loop for every item, in the order of ``put``.
-        depth: items that may wait; beyond that the oldest one of the lowest rank is lost.
-        on_loss: called on the loop with the number lost since the last delivery.
-        rank: worth of an item; None = all are worth the same.
-        discard: called with every item that waited and is not delivered, on the loop or in the thread of a ``put``.
+        depth: maximum number of waiting items; beyond that the oldest one of the lowest rank is dropped.
+        on_loss: called on the loop with the number dropped since the last delivery.
+        rank: rank of an item; None: all are equal.
+        discard: called with every undelivered item, on the loop or in the thread of a ``put``.
     """
 
     def __init__(
@@ -37,7 +37,9 @@ class ThreadHop(Generic[T]):
         self._rank = rank
         self._discard = discard
         self._items: deque[T] = deque()
-        """Any thread may use its ends; items between them, and with ranks the left end too, need the lock."""
+        """Any thread may use the ends of the deque; items in the middle, and with ranks also the left end, need the
+        lock.
+        """
         self._loop = asyncio.get_running_loop()
         self._lock = threading.Lock()
         self._scheduled = False
@@ -75,7 +77,7 @@ class ThreadHop(Generic[T]):
             if len(self._items) <= self._depth:
                 return
             if self._rank is not None:
-                # By number, for items may come meanwhile.
+                # By number, because items may arrive meanwhile.
                 ranks = [self._rank(self._items[i]) for i in range(len(self._items))]
                 least = ranks.index(min(ranks))
                 item: T | None = self._items[least]
@@ -100,7 +102,7 @@ class ThreadHop(Generic[T]):
                 item = self._pop()
         if not items:
             self._scheduled = False
-        if items:  # perhaps put meanwhile by a thread that still saw it scheduled
+        if items:  # a thread that still saw it scheduled may have added an item meanwhile
             self._scheduled = True
             self._loop.call_soon(self._take)
         if self._lost:
@@ -113,7 +115,7 @@ class ThreadHop(Generic[T]):
     def _pop(self) -> T | None:
         try:
             return self._items.popleft()
-        except IndexError:  # another thread was quicker
+        except IndexError:  # another thread was faster
             return None
 
 
@@ -146,7 +148,7 @@ async def in_daemon_thread(function: Callable[[], T]) -> T:
 
 
 async def inline(function: Callable[[], T]) -> T:
-    """Run ``function`` on the loop: for the virtual clock, whose time would run on while a thread works."""
+    """Run ``function`` on the loop: for the virtual clock, whose time would advance while a thread works."""
     return function()
 
 

@@ -31,22 +31,22 @@ M = TypeVar("M", bound=Message)
 T = TypeVar("T")
 
 WAIT: Final = 5.0
-"""Seconds to wait for a message by default."""
+"""Default timeout for a message (s)."""
 
 
 class Truck:
     """Session with one robot, over a ``TruckClient`` on an event loop in a separate thread.
 
-    A context manager; without ``with`` it opens at the first call, and closes with ``close()``, when nothing refers to
-    it any longer, or at the program's end. Calls may come from any thread; calls of other threads that still wait at
-    its close raise ``RuntimeError``, and so does a call in a process that was forked from this one: open another there.
-    Ctrl-C during ``goto`` cancels the goal.
+    A context manager. Without ``with`` it opens at the first call, and closes with ``close()``, when it is
+    garbage-collected, or at the end of the program. Calls may come from any thread. Closing makes pending calls of
+    other threads raise ``RuntimeError``. A call in a forked process also raises it: open another session there. Ctrl-C
+    during ``goto`` cancels the goal.
 
     Args:
-        robot: name in the keys ``mt/<robot>/...``; None = ``truck``.
-        endpoint: where the robot listens; see ``TruckClient``.
+        robot: name in the keys ``mt/<robot>/...``; None: ``truck``.
+        endpoint: address of the robot; see ``TruckClient``.
         source: this program's name in requests; see ``TruckClient``.
-        timeout: seconds to wait for the link and for answers.
+        timeout: timeout for the link and for answers, s.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class Truck:
         self._finalizer: weakref.finalize[..., Truck] | None = None
 
     def __enter__(self) -> Self:
-        """Connect. Raises as ``TruckClient`` does."""
+        """Connect. Raises the errors of ``TruckClient``."""
         self._opened()
         return self
 
@@ -82,33 +82,33 @@ class Truck:
     # Messages of the robot
 
     def get(self, topic: Topic[M], timeout: float = WAIT) -> M:
-        """Latest message of ``topic`` if it is retained, else the next one.
+        """Latest message of ``topic`` if it is retained, otherwise the next one.
 
         Raises:
-            NoAnswerError: none within ``timeout`` s.
+            NoAnswerError: no message within ``timeout`` s.
         """
         with self.stream(topic, timeout) as messages:
             return next(messages)
 
     def stream(self, topic: Topic[M], timeout: float = WAIT, depth: int = 256) -> "MessageStream[M]":
-        """Iterator over messages of ``topic``; up to ``depth`` wait, then the oldest is lost.
+        """Iterator over messages of ``topic``; up to ``depth`` wait, then the oldest is dropped.
 
-        Iterating raises ``NoAnswerError`` if none comes within ``timeout`` s.
+        Iteration raises ``NoAnswerError`` if no message arrives within ``timeout`` s.
         """
         return MessageStream(self, topic, timeout, depth)
 
     def call(self, rpc: str, payload: dict[str, Any] | None = None, timeout: float | None = None) -> dict[str, Any]:
-        """Call ``rpc`` on the robot with a JSON object. Raises as ``TruckClient.call`` does."""
+        """Call ``rpc`` on the robot with a JSON object. Raises the errors of ``TruckClient.call``."""
         return self._do(lambda client: client.call(rpc, payload, timeout))
 
     def alive(self) -> bool:
-        """Whether the robot's daemon serves at this moment."""
+        """Whether the robot's daemon is running."""
         return self._do(lambda client: client.alive())
 
     # Orders
 
     def arm(self, *, hold: bool = False) -> GateState:
-        """Allow driving, unless ``hold`` by planners too. Raises as ``TruckClient.order`` does, as all orders do."""
+        """Allow driving, with ``hold`` except by planners. All orders raise the errors of ``TruckClient.order``."""
         return self._do(lambda client: client.arm(hold=hold))
 
     def disarm(self) -> GateState:
@@ -135,14 +135,15 @@ class Truck:
         """Drive to a pose in the map and wait for the end.
 
         Args:
-            x: m.
-            y: m.
-            yaw: rad.
-            via: places to pass, x, y and optionally yaw.
-            arm: arm the truck as well; it drives off at once. Otherwise another client has to arm it.
+            x: position, m.
+            y: position, m.
+            yaw: heading, rad.
+            via: waypoints, x, y and optionally yaw.
+            arm: whether to arm the truck, which then starts to drive at once; otherwise another client has to arm it.
 
         Raises:
-            RequestRefusedError: the goal or the arming was refused, or the goal was given up; carries the reason.
+            RequestRefusedError: the goal or the arming was refused, or the robot abandoned the goal; carries the
+                reason.
             NoAnswerError: the robot does not answer.
         """
         return _reached(self._do(lambda client: drive_to(client, self._clock, (x, y, yaw), via, arm=arm)))
@@ -152,15 +153,15 @@ class Truck:
         self._do(lambda client: client.goal_control(GoalOrder.CANCEL))
 
     def follow(self, path: Path, *, arm: bool = False) -> Arrival:
-        """Drive along a path and wait for the end. Raises as ``goto`` does."""
+        """Drive along a path and wait for the end. Raises the errors of ``goto``."""
         return _reached(self._do(lambda client: follow(client, self._clock, path, arm=arm)))
 
     def drive(self, speed: float, front: float, rear: float = 0.0, lease: float = 0.25) -> None:
-        """Request a speed (m/s) and axle angles (rad) for ``lease`` s; nothing repeats it."""
+        """Request a speed (m/s) and axle angles (rad) for ``lease`` s; the request is not repeated."""
         self._do(lambda client: client.drive(speed, front, rear, lease))
 
     def drive_twist(self, vx: float, vy: float = 0.0, wz: float = 0.0, lease: float = 0.25) -> None:
-        """Request a velocity of the base, m/s and rad/s, for ``lease`` s; nothing repeats it."""
+        """Request a velocity of the base, m/s and rad/s, for ``lease`` s; the request is not repeated."""
         self._do(lambda client: client.drive_twist(vx, vy, wz, lease))
 
     def _do(self, work: Callable[[TruckClient], Coroutine[Any, Any, T]]) -> T:
@@ -170,16 +171,16 @@ class Truck:
         with self._lock:
             if self._loop is None:
                 self._loop = _LoopThread(self._make)
-                # It must not refer to this object, which would never be forgotten then.
+                # It must not refer to this object, which could then never be collected.
                 self._finalizer = weakref.finalize(self, self._loop.close)
             return self._loop
 
 
 class MessageStream(Iterator[M]):
-    """Messages of one topic; ends with its ``with`` block, or when it is forgotten."""
+    """Messages of one topic; ends with its ``with`` block, or when it is garbage-collected."""
 
     def __init__(self, truck: Truck, topic: Topic[M], timeout: float, depth: int) -> None:
-        self._truck = truck  # which would close itself if nothing else refers to it
+        self._truck = truck  # which would close itself if no other reference exists
         self._loop = truck._opened()  # noqa: SLF001 - one module
         self._topic = topic
         self._timeout = timeout
@@ -191,10 +192,10 @@ class MessageStream(Iterator[M]):
         self._finalizer = weakref.finalize(self, self._loop.later, self._box.close)
 
     def __next__(self) -> M:
-        """The next message.
+        """Return the next message.
 
         Raises:
-            NoAnswerError: none in time.
+            NoAnswerError: no message in time.
         """
 
         async def following(_: TruckClient) -> M | None:
@@ -215,7 +216,7 @@ class MessageStream(Iterator[M]):
 
 
 class _LoopThread:
-    """An event loop in a thread, with a client that is open as long as it runs.
+    """Event loop in a thread, with a client that is open while it runs.
 
     Raises:
         TruckError: the client could not be opened.
@@ -234,17 +235,17 @@ class _LoopThread:
             raise
 
     def do(self, work: Callable[[TruckClient], Coroutine[Any, Any, T]]) -> T:
-        """Run a coroutine there and wait for its result; an interrupt here cancels it there."""
+        """Run a coroutine on that loop and wait for its result; an interrupt cancels it."""
         return self._submit(work(self._client))
 
     def later(self, function: Callable[[], object]) -> None:
-        """Call ``function`` there, without waiting; nothing happens when the loop has ended."""
+        """Call ``function`` on that loop without waiting; no effect after the loop has ended."""
         with suppress(RuntimeError):
             self._loop.call_soon_threadsafe(function)
 
     def close(self) -> None:
         """Close the client and end the thread."""
-        if threading.current_thread() is self._thread:  # the collector of garbage runs anywhere
+        if threading.current_thread() is self._thread:  # the garbage collector may run in any thread
             self._last = self._loop.create_task(self._close_here())
         elif self._thread.is_alive():
             self._submit(self._client.__aexit__(None, None, None))
@@ -265,7 +266,7 @@ class _LoopThread:
             raise RuntimeError("the session was closed meanwhile") from None
         except BaseException:
             if not future.done():
-                # The coroutine takes its request back, and ends, before the interrupt is passed on.
+                # The coroutine withdraws its request and ends before the interrupt is passed on.
                 future.cancel()
                 self._settle()
             raise
@@ -278,7 +279,7 @@ class _LoopThread:
         asyncio.run_coroutine_threadsafe(others(), self._loop).result()
 
     async def _give_up(self) -> None:
-        """End the calls of other threads that still wait for something."""
+        """End the pending calls of other threads."""
         tasks = asyncio.all_tasks() - {asyncio.current_task()}
         for task in tasks:
             task.cancel()
@@ -299,10 +300,10 @@ class _LoopThread:
 
 
 def _reached(arrival: Arrival) -> Arrival:
-    """The arrival, if it is one.
+    """Return the arrival if the robot arrived.
 
     Raises:
-        RequestRefusedError: the drive ended otherwise.
+        RequestRefusedError: the drive ended without arrival.
     """
     if arrival.reason is not Reason.GOAL_REACHED:
         raise RequestRefusedError(arrival.reason, f"{arrival.reason.text}: {arrival.text}")

@@ -19,12 +19,12 @@ _EXPECTED: Final = "YAML"
 
 
 class _BoundedComposer(Composer):
-    """Builds the nodes of one document, until they are too many.
+    """Builds the nodes of one document up to a maximum number.
 
     Args:
         loader: loader of the document.
-        most: nodes.
-        expand: count the target of an alias each time; otherwise the reader bounds it.
+        most: maximum number of nodes.
+        expand: whether to count the target of an alias each time; otherwise the reader bounds it.
     """
 
     def __init__(self, loader: Any = None, *, most: int, expand: bool) -> None:
@@ -32,10 +32,10 @@ class _BoundedComposer(Composer):
         self._most, self._expand = most, expand
         self._count = 0
         self._sizes: dict[int, int] = {}
-        """Nodes in each complete node, by its id."""
+        """Number of nodes in each complete node, by its id."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """One node with all below it."""
+        """Count a node and everything below it."""
         alias, place = self.parser.check_event(AliasEvent), self.parser.peek_event().start_mark
         before = self._count
         self._count += 1
@@ -51,9 +51,9 @@ class _BoundedComposer(Composer):
         return node
 
 
-# 20_000: keys and values of one file at most, those behind aliases counted each time: read in a second
+# 20_000: maximum number of keys and values in one file, counting aliased ones each time: read in a second
 def bounded_yaml(most: int = 20_000, *, expand: bool = True) -> YAML:
-    """Return a reader of one document of plain data with bounds of depth and size; see ``_BoundedComposer``."""
+    """Return a reader of one document of plain data with limited depth and size; see ``_BoundedComposer``."""
     yaml = YAML(typ="safe", pure=True)
     yaml.max_depth = 50
     yaml.Composer = partial(_BoundedComposer, most=most, expand=expand)  # type: ignore[assignment]  # it is only called
@@ -64,7 +64,7 @@ def read_yaml(path: Path) -> Any:
     """Content of a file.
 
     Raises:
-        InputError: it cannot be read, is not YAML, or is too long or nested too deeply.
+        InputError: it cannot be read, is not YAML, or is too large or nested too deeply.
     """
     text = text_of(path, _EXPECTED, LARGEST_YAML)
     with reading(path, _EXPECTED):
@@ -83,7 +83,7 @@ def yaml_problem(error: MarkedYAMLError) -> str:
 
 
 def yaml_text(value: Any) -> str:
-    """Plain data as YAML in block style; keys stay in their order."""
+    """Format plain data as YAML in block style; keys keep their order."""
     yaml, text = YAML(typ="safe", pure=True), io.StringIO()
     yaml.default_flow_style = False
     yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]  # its annotation knows None only

@@ -1,7 +1,7 @@
-"""Foundations of every message: strict frozen models, read-only arrays, one header.
+"""Base of every message: strict frozen models, read-only arrays, one header.
 
-Units are SI and radians everywhere; frames follow REP 103 (x forward, y left, z up) and REP 105
-(map > odom > base > sensors). A value that is absent is ``None``, never NaN.
+Units are SI and radians everywhere; frames follow REP 103 (x forward, y left, z up) and REP 105 (map > odom > base >
+sensors). A missing value is ``None``, never NaN.
 """
 
 import ast
@@ -33,11 +33,11 @@ from pydantic_core import CoreSchema
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")]
-"""Of a robot, a behaviour or a mission."""
+"""Name of a robot, a behaviour or a mission."""
 
 
 class Live:
-    """Marks a setting, in its ``Annotated`` type, that may be changed while the robot runs."""
+    """Marks a setting, in its ``Annotated`` type, that can be changed while the robot runs."""
 
 
 LIVE: Final = Live()
@@ -45,20 +45,20 @@ LiveValue = float | int | bool | str
 
 
 class Schema(BaseModel):
-    """A strict, frozen record; unknown fields are refused when constructed, ignored on the wire."""
+    """A strict, frozen record; unknown fields are rejected on construction, ignored on the wire."""
 
     model_config = ConfigDict(
         frozen=True,
         strict=True,
         extra="forbid",
         allow_inf_nan=False,
-        ser_json_inf_nan="constants",  # a non-finite request must reach the gate to be refused by name
+        ser_json_inf_nan="constants",  # a non-finite request must reach the gate, which refuses it by name
         arbitrary_types_allowed=True,
     )
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        """Schema with the fields' docstrings as descriptions."""
+        """Schema with the docstrings of its fields as descriptions."""
         found = handler(schema)
         properties = handler.resolve_ref_schema(found).get("properties", {})
         for name, text in field_docs(cls).items():
@@ -76,7 +76,7 @@ class Schema(BaseModel):
 
 
 def first_mistake(error: ValidationError, *before: str) -> str:
-    """Key and text of the first validation error; ``before`` are the keys that lead there."""
+    """Key and text of the first validation error; ``before`` are the parent keys."""
     detail = error.errors(include_url=False)[0]
     where = ".".join(map(str, (*before, *detail["loc"])))
     text = detail["msg"].removeprefix("Value error, ")
@@ -84,10 +84,10 @@ def first_mistake(error: ValidationError, *before: str) -> str:
 
 
 def field_docs(model: type[BaseModel]) -> dict[str, str]:
-    """Description of each field, or the docstring behind it.
+    """Description of each field, or the docstring after it.
 
-    Read from the source on demand: pydantic's ``use_attribute_docstrings`` does so whenever a model is
-    defined, which takes a third of the start of every process.
+    Read from the source on demand: pydantic's ``use_attribute_docstrings`` does so for every model definition, which
+    takes a third of the start of every process.
     """
     found: dict[str, str | None] = {}
     for base in reversed(model.__mro__[: model.__mro__.index(BaseModel)]):
@@ -98,7 +98,7 @@ def field_docs(model: type[BaseModel]) -> dict[str, str]:
 
 @cache
 def _docs_in(module: str) -> dict[str, dict[str, str | None]]:
-    """Docstrings behind annotated names, by qualified name of the class."""
+    """Docstrings after annotated names, by qualified name of the class."""
     try:
         tree = ast.parse(inspect.getsource(sys.modules[module]))
     except (KeyError, OSError, TypeError):
@@ -130,10 +130,10 @@ def _docs_behind(body: list[ast.stmt]) -> Iterator[tuple[str, str | None]]:
 
 @dataclass(frozen=True, slots=True)
 class LiveSetting:
-    """One setting that may be changed while the robot runs."""
+    """One setting that can be changed while the robot runs."""
 
     key: str
-    """Dotted."""
+    """Dotted key."""
     value: LiveValue
     meaning: str
     above: float | None = None
@@ -144,7 +144,7 @@ class LiveSetting:
 
 
 def live_settings(config: Schema, prefix: str = "") -> Iterator[LiveSetting]:
-    """All live settings of a configuration, in its order."""
+    """All live settings of a configuration, in order."""
     for name, field in type(config).model_fields.items():
         value = getattr(config, name)
         if isinstance(value, Schema):
@@ -181,12 +181,12 @@ def _frozen_array(dtype: type[np.generic], size: int | None) -> PlainValidator:
 
 
 def _array(value: Any, dtype: type[np.generic], info: ValidationInfo) -> NDArray[Any]:
-    """One-dimensional array of what came in.
+    """Convert input to a one-dimensional array.
 
     Raises:
-        ValueError: it cannot be one.
+        ValueError: the input is not one.
     """
-    # It is looked at first: numpy takes its time over strings and nested lists.
+    # Checked first, because numpy is slow on strings and nested lists.
     if info.mode == "json" and not (isinstance(value, list) and {int, float}.issuperset(map(type, value))):
         raise ValueError("expected a list of numbers")
     try:
@@ -225,21 +225,21 @@ def position_deviation(covariance: NDArray[np.float64]) -> float:
 
 
 Nanoseconds = Annotated[int, Field(ge=-(2**63), lt=2**63)]
-"""Nanoseconds of CLOCK_MONOTONIC (of the daemon's clock: wall, virtual or replay)."""
+"""Time in nanoseconds of CLOCK_MONOTONIC (of the daemon's clock: wall, virtual or replay)."""
 FrameId = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=64)]
 
 
 class Message(Schema):
-    """Header shared by every topic."""
+    """Header of every topic."""
 
     stamp: Nanoseconds
-    """When the measurement was true, mapped from the sensor's clock where it has one."""
+    """Time of the measurement, mapped from the sensor's clock if it has one."""
     received: Nanoseconds
-    """When the daemon had all bytes of it."""
+    """Time when the daemon had received it completely."""
     seq: Annotated[int, Field(ge=0, lt=2**63)]
-    """Counts messages of this topic since the daemon started; a gap is a loss."""
+    """Number of this message since the daemon started; a gap is a loss."""
     frame: FrameId = "base"
-    """Coordinate frame the values are expressed in."""
+    """Coordinate frame of the values."""
 
 
 class Pose2D(Schema):
@@ -264,6 +264,6 @@ def servos_of(front: float, front_right: float | None, rear: float, rear_right: 
 
 
 def servo_fields(servos: Sequence[float], suffix: str = "") -> dict[str, Any]:
-    """Fields of a message for its servo angles, two or four as by ``servos_of``; ``suffix`` ends their names."""
+    """Fields of a message for its servo angles, two or four as in ``servos_of``, with the ``suffix`` of their names."""
     names = ("front", "front_right", "rear", "rear_right")
     return {f"{n}{suffix}": angle for n, angle in zip(names[:: len(names) // len(servos)], servos, strict=True)}

@@ -1,4 +1,4 @@
-"""Prints for cameras: the calibration board, and the colours of discs that robots carry."""
+"""Printed patterns for cameras: the calibration board, and the colours of discs on robots."""
 
 from typing import Annotated, Literal, Self
 
@@ -16,20 +16,20 @@ TagFamily = Literal[
     "aruco_6x6_50", "aruco_6x6_100", "aruco_6x6_250", "aruco_6x6_1000",
     "aruco_7x7_50", "aruco_7x7_100", "aruco_7x7_250", "aruco_7x7_1000",
 ]  # fmt: skip
-"""Families of tags that OpenCV reads."""
+"""Tag families supported by OpenCV."""
 
 
 class BoardConfig(Schema):
-    """Printed ChArUco board, its markers of family 36h11."""
+    """Printed ChArUco board with markers of family 36h11."""
 
     columns: Annotated[int, Field(ge=4, le=30)] = 8
-    """Squares"""
+    """Number of squares across"""
     rows: Annotated[int, Field(ge=4, le=30)] = 6
-    """Squares"""
+    """Number of squares down"""
     square: Annotated[float, Field(gt=0, le=1)] = 0.04
-    """m, as measured on the print"""
+    """Side of a square as measured on the print, m"""
     marker: Annotated[float, Field(gt=0, le=1)] = 0.03
-    """m"""
+    """Side of a marker, m"""
 
     @model_validator(mode="after")
     def _markers_lie_in_squares(self) -> Self:
@@ -39,10 +39,10 @@ class BoardConfig(Schema):
 
     @property
     def width(self) -> float:
-        """M."""
+        """Width of the board, m."""
         return self.columns * self.square
 
     @property
     def height(self) -> float:
-        """M."""
+        """Height of the board, m."""
         return self.rows * self.square

@@ -1,8 +1,9 @@
-"""The robot's body, for the configurations of daemon and simulated world: drive families by ``kind``.
+"""Robot bodies for the configurations of daemon and simulated world: drive families by ``kind``.
 
-Lengths that every robot has (wheelbase, track, wheel radius, gear ratio) are in ``geometry``. Requests are the twist of
-the base, or its speed and two axle angles; a body without axles is then driven as the bicycle of its ``wheelbase`` with
-the same motion. ``devices.drive`` is its first driven shaft, ``drive_2`` to ``drive_4`` are the others, in this order.
+Lengths common to all robots (wheelbase, track, wheel radius, gear ratio) are in ``geometry``. Requests contain the
+twist of the base, or its speed and two axle angles; a body without axles then follows the motion of the equivalent
+bicycle with its ``wheelbase``. ``devices.drive`` is its first driven shaft, ``drive_2`` to ``drive_4`` are the others,
+in this order.
 """
 
 import math
@@ -21,17 +22,17 @@ class Mount(Schema):
     """Pose of a sensor in the base frame."""
 
     x: Annotated[float, Field(ge=-2, le=2)] = 0.0
-    """Metres forward of the base point"""
+    """Position forward of the base point, m"""
     y: Annotated[float, Field(ge=-2, le=2)] = 0.0
-    """Metres left of the base point"""
+    """Position left of the base point, m"""
     z: Annotated[float, Field(ge=-2, le=2)] = 0.0
-    """Metres above the base point"""
+    """Height above the base point, m"""
     roll: Annotated[float, Field(ge=-math.pi, le=math.pi)] = 0.0
-    """Radians about x"""
+    """Rotation about x, rad"""
     pitch: Annotated[float, Field(ge=-math.pi, le=math.pi)] = 0.0
-    """Radians about y"""
+    """Rotation about y, rad"""
     yaw: Annotated[float, Field(ge=-math.pi, le=math.pi)] = 0.0
-    """Radians about z"""
+    """Rotation about z, rad"""
 
     @property
     def planar(self) -> tuple[float, float, float]:
@@ -40,40 +41,40 @@ class Mount(Schema):
 
 
 class LensConfig(Schema):
-    """Projection of a camera: a pinhole with the distortion of Brown; as nominal, or as calibrated."""
+    """Camera projection: a pinhole with Brown's distortion, nominal or calibrated."""
 
     width: Annotated[int, Field(ge=16, le=8192)] = 640
-    """Width of the pictures it is calibrated for, pixels; it is scaled for others"""
+    """Image width at calibration, pixels; scaled for other widths"""
     height: Annotated[int, Field(ge=16, le=8192)] = 480
-    """Pixels"""
+    """Image height at calibration, pixels"""
     focal_x: Annotated[float, Field(gt=10, le=20_000)] = 522.2
-    """Pixels; nominal: 63 degrees across 640 pixels"""
+    """Horizontal focal length, pixels; nominal: 63 degrees across 640 pixels"""
     focal_y: Annotated[float, Field(gt=10, le=20_000)] = 522.2
-    """Pixels"""
+    """Vertical focal length, pixels"""
     centre_x: Annotated[float, Field(ge=0, le=8192)] = 319.5
-    """Principal point; the middle of the first pixel is 0"""
+    """Principal point x, pixels; 0 is the centre of the first pixel"""
     centre_y: Annotated[float, Field(ge=0, le=8192)] = 239.5
-    """Pixels"""
+    """Principal point y, pixels"""
     k1: Coefficient = 0.0
     """Radial distortion, second order"""
     k2: Coefficient = 0.0
-    """Fourth order"""
+    """Radial distortion, fourth order"""
     k3: Coefficient = 0.0
-    """Sixth order"""
+    """Radial distortion, sixth order"""
     p1: Coefficient = 0.0
-    """Tangential distortion"""
+    """Tangential distortion, first coefficient"""
     p2: Coefficient = 0.0
-    """The other axis"""
+    """Tangential distortion, second coefficient"""
 
 
 class BodyConfig(Schema):
-    """What only one kind of body has; each kind is a subclass."""
+    """Settings specific to one kind of body; each kind is a subclass."""
 
     kind: str
 
 
 class TurnDeficitConfig(Schema):
-    """Turn that the axles lack compared with their linkage; dimensionless, 0 for none.
+    """Shortfall of the turn compared with the linkage; dimensionless, 0: none.
 
     The tangent t of an axle angle becomes t (1 - c t^2), with a coefficient c for each axle and steering side; where
     the axles oppose each other, the turn becomes turn (1 + c t_front t_rear), with a coefficient for each direction of
@@ -93,7 +94,7 @@ class TruckBody(BodyConfig):
 
     kind: Literal["truck"] = "truck"
     turn_deficit: TurnDeficitConfig = TurnDeficitConfig()
-    """Measured by circles to both sides, with each axle alone and with both"""
+    """Measured by circles in both directions, with each axle alone and with both"""
 
 
 class AckermannBody(BodyConfig):
@@ -107,7 +108,7 @@ class BicycleBody(BodyConfig):
 
     kind: Literal["bicycle"]
     driven: Literal["front", "rear"] = "rear"
-    """Wheel that the motor drives"""
+    """Wheel driven by the motor"""
 
 
 class TricycleBody(BodyConfig):
@@ -115,7 +116,7 @@ class TricycleBody(BodyConfig):
 
     kind: Literal["tricycle"]
     driven: Literal["front", "rear"] = "front"
-    """Axle that the motor drives"""
+    """Axle driven by the motor"""
 
 
 class IndependentBody(BodyConfig):
@@ -137,7 +138,7 @@ class SkidSteerBody(BodyConfig):
 
     kind: Literal["skid_steer"]
     motors: Literal["sides", "wheels"] = "sides"
-    """One for each side, or for each wheel: front left, front right, rear left, rear right"""
+    """One motor per side, or one per wheel: front left, front right, rear left, rear right"""
     icr_left: float | None = None
     """Lateral position of the left side's turning centre, m; default half the track, i.e. without skidding"""
     icr_right: float | None = None
@@ -151,7 +152,7 @@ class SkidSteerBody(BodyConfig):
 
 
 class SynchroBody(BodyConfig):
-    """Wheels that roll (one motor) and turn (the front servo) together; the body keeps its heading."""
+    """Wheels that all roll (one motor) and turn (the front servo) together; the body keeps its heading."""
 
     kind: Literal["synchro"]
 
@@ -163,7 +164,7 @@ class OmniBody(BodyConfig):
     circle: Metres = 0.2
     """Radius of the circle, m"""
     count: Annotated[int, Field(ge=3, le=4)] = 3
-    """Wheels"""
+    """Number of wheels"""
 
 
 class MecanumBody(BodyConfig):

@@ -6,14 +6,14 @@ from monstertruck_schemas.base import Message, servos_of
 
 
 class DriveAction(StrEnum):
-    """Command to the drive controller."""
+    """Mode of a drive command."""
 
     DISABLE = "disable"
     """Power stage off: the motor coasts."""
     RUN = "run"
     """Follow ``motor_velocity`` (0 holds)."""
     QUICK_STOP = "quick_stop"
-    """Brake as hard as configured, now, ahead of everything queued."""
+    """Brake with the configured maximum deceleration at once, ahead of queued commands."""
 
 
 class DriveCommand(Message):
@@ -24,14 +24,14 @@ class DriveCommand(Message):
     speed: float
     """Wheel speed over ground, m/s."""
     motor_velocity: float
-    """The same at the motor shaft, rad/s, robot's sign (forward positive)."""
+    """Motor shaft speed, rad/s, robot's sign (forward positive)."""
 
 
 class SteeringCommand(Message):
-    """Steering of both axles: bicycle angles and the servo angles they need."""
+    """Steering of both axles: bicycle angles and the corresponding servo angles."""
 
     front: float
-    """Angle of the equivalent bicycle's axle, rad, left positive; 0 for a motion that no bicycle makes."""
+    """Axle angle of the equivalent bicycle, rad, left positive; 0 for a motion without an equivalent bicycle."""
     rear: float
     """Angle of the rear axle, likewise."""
     front_servo: float
@@ -39,11 +39,11 @@ class SteeringCommand(Message):
     rear_servo: float
     """Servo angle of the rear axle, likewise."""
     front_right_servo: float | None = None
-    """Servo of the front right wheel, if every wheel has one; ``front_servo`` is then the front left one."""
+    """Servo angle of the front right wheel, if every wheel has a servo; ``front_servo`` is then the front left one."""
     rear_right_servo: float | None = None
-    """Servo of the rear right wheel; ``rear_servo`` is then the rear left one."""
+    """Servo angle of the rear right wheel; ``rear_servo`` is then the rear left one."""
     deadman: bool = True
-    """Level of the deadman line, where it is wired: False stops the motor without a word to its controller."""
+    """Level of the deadman line, if wired: False stops the motor without its controller's software."""
 
     @property
     def servos(self) -> tuple[float, ...]:

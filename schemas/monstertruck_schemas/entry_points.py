@@ -1,4 +1,4 @@
-"""Tables that other installed distributions extend through entry points.
+"""Tables that other installed distributions extend by entry points.
 
 A broken entry point is reported and skipped: it never keeps the robot from starting.
 """
@@ -30,7 +30,7 @@ R = TypeVar("R", bound=Named)
 
 @dataclass(frozen=True, slots=True)
 class Broken:
-    """An entry point that was left out."""
+    """A skipped entry point."""
 
     group: str
     name: str
@@ -49,9 +49,9 @@ class _Read(NamedTuple):
 
 
 class ExtensibleTable(Mapping[str, R]):
-    """Rows by name: ours in the order given, then rows of other distributions, read on first use.
+    """Rows by name: built-in ones in the given order, then rows of other distributions, read on first use.
 
-    Each entry point has the name of the row that it points to.
+    Each entry point has the name of its row.
 
     Args:
         group: group of the entry points, for instance ``monstertruck.trackers``.
@@ -64,7 +64,7 @@ class ExtensibleTable(Mapping[str, R]):
 
     @abstractmethod
     def fault(self, row: Any) -> str | None:
-        """Fault of a row of another distribution, or None; it may raise as well."""
+        """Error in a row of another distribution, or None; it may also raise."""
 
     @cached_property
     def _read(self) -> _Read:
@@ -106,7 +106,7 @@ class ExtensibleTable(Mapping[str, R]):
 
     @property
     def broken(self) -> tuple[Broken, ...]:
-        """Entry points that were left out."""
+        """Skipped entry points."""
         return self._read.broken
 
 
@@ -114,18 +114,18 @@ _LEFT_OUT: Final[dict[str, tuple[Broken, ...]]] = {}
 
 
 def left_out() -> Iterator[Broken]:
-    """Yield the entry points left out of the tables that this process has read."""
+    """Yield the skipped entry points of the tables that this process has read."""
     for broken in _LEFT_OUT.values():
         yield from broken
 
 
 def wrong_value(row: Any) -> str | None:
-    """Return the first field of a row whose value its annotation does not allow, with what is allowed; None if all fit.
+    """Return the first field of a row whose value violates its annotation, with the allowed values; None if all fit.
 
     Rows within the row are checked as well.
 
     Args:
-        row: A dataclass; anything else fits.
+        row: dataclass instance; other objects always fit.
     """
     if not is_dataclass(row):
         return None

@@ -1,4 +1,4 @@
-"""Messages of the ``event`` group: things that happened once."""
+"""Messages of the ``event`` group: single occurrences."""
 
 from enum import StrEnum
 from typing import Annotated
@@ -12,7 +12,7 @@ from monstertruck_schemas.state import GateMode
 
 
 class Severity(StrEnum):
-    """How much an operator should care."""
+    """Importance for an operator."""
 
     INFO = "info"
     WARNING = "warning"
@@ -27,39 +27,39 @@ class Event(Message):
     severity: Severity
     """Severity."""
     source: str
-    """Service or device it happened to."""
+    """Service or device concerned."""
     text: str = ""
     """Event in words."""
     values: dict[str, float | int | str | bool | None] = {}
-    """Measurements behind the decision."""
+    """Measurements behind the event."""
 
 
 class Call(Message):
-    """A remote call that was answered: who asked for what, and the answer."""
+    """An answered remote call: caller, call and answer."""
 
     name: str
     """Name of the call, e.g. ``goal``."""
     source: str
-    """Who called, by the key."""
+    """Caller, from the key."""
     payload: str
-    """JSON object, cut after ``CALL_TEXT`` characters."""
+    """JSON object, truncated to ``CALL_TEXT`` characters."""
     reason: Reason
-    """``ok``, or why it was refused."""
+    """``ok``, or the reason for the refusal."""
     answer: str
-    """JSON object, or the text of the refusal; cut to the same length."""
+    """JSON object, or the text of the refusal; truncated to the same length."""
 
 
 CALL_TEXT = 4096
-"""Characters of a call's payload and of its answer that are recorded: a hundred waypoints."""
+"""Maximum recorded length of a call's payload and answer, characters: a hundred waypoints."""
 
 
 class Measurement(Schema):
-    """One figure behind a stop."""
+    """One measurement behind a stop."""
 
     name: str
     """Name of the quantity."""
     value: float | None = None
-    """None if never measured, or out of range."""
+    """Value; None if never measured, or out of range."""
     unit: str = ""
     """SI unit; empty for plain numbers."""
     limit: float | None = None
@@ -74,9 +74,9 @@ class Cause(Schema):
     reason: Reason
     """Reason code."""
     source: str
-    """Device, service, program or person it happened to or came from."""
+    """Device, service, program or person concerned."""
     since: Nanoseconds
-    """When it began."""
+    """Time when it began."""
     text: str
     """Cause in words."""
     measurements: tuple[Measurement, ...] = ()
@@ -87,18 +87,18 @@ class Cause(Schema):
 class Stop(Message):
     """Cause of a stop by the gate: the tripped checks with start and measurements, and the causes behind them.
 
-    ``stamp`` is the moment of the stop. A cause behind it that becomes known a little later (a lost hub is judged once
-    all its devices are gone) is added by a second message of the same ``number``.
+    ``stamp`` is the time of the stop. If a cause becomes known later (a hub is reported lost only once all its devices
+    are gone), a second message with the same ``number`` adds it.
     """
 
     number: Annotated[int, Field(ge=1)]
-    """Counts the stops since the daemon started."""
+    """Number of the stop since the daemon started."""
     reason: Reason
     """Reason of the first cause."""
     mode: GateMode
-    """State of the gate after it."""
+    """State of the gate after the stop."""
     ordered: bool = False
-    """An operator ordered an ordinary end of driving."""
+    """Whether an operator ordered it as a normal end of driving."""
     quick: bool = False
     """Whether it was the drive's quick stop instead of its ordinary ramp."""
     holder: str | None = None
@@ -108,13 +108,13 @@ class Stop(Message):
     speed: float | None = None
     """Measured speed at its start (m/s); None if unknown."""
     stopping_distance: float = 0.0
-    """Metres the truck was still expected to travel."""
+    """Expected stopping distance at its start, m."""
     causes: Annotated[tuple[Cause, ...], Field(min_length=1)]
     """Tripped checks, worst first, then the causes behind them."""
     black_box: str | None = None
-    """Name of the black-box file that will hold the minute before; None if none is written."""
+    """Name of the black-box file with the minute before the stop; None if none is written."""
     text: str
-    """All of it in one line."""
+    """Description of all causes in one line."""
 
 
 class LogLevel(StrEnum):
@@ -133,7 +133,7 @@ class LogRecord(Message):
     level: LogLevel
     """Level of the record."""
     name: str
-    """Logger: the module it came from."""
+    """Name of the logger: its module."""
     text: str
     """Message."""
     file: str = ""

@@ -33,7 +33,7 @@ class ServiceHealth(Schema):
     reason: Reason = Reason.OK
     """Reason of the state."""
     detail: str = ""
-    """Last error in words; empty when there was none."""
+    """Last error in words; empty without an error."""
 
 
 class HealthTable(Message):
@@ -54,19 +54,19 @@ class CalibrationState(Schema):
     until: str
     """Last valid day, UTC."""
     metres_left: float | None = None
-    """Distance that may be driven until it expires, m; None: not limited."""
+    """Remaining distance until it expires, m; None: unlimited."""
     expired: str = ""
     """Reason for its expiry; empty while it is valid."""
 
 
 class CalibrationHealth(Message):
-    """The calibration that the daemon runs on; published on change and once a minute."""
+    """Calibration used by the daemon; published on change and once a minute."""
 
     wizards: tuple[CalibrationState, ...] = ()
     odometer: float = 0.0
     """Total distance driven, m."""
     proposed: str = ""
-    """Calibration proposed by a tracker and not accepted yet, as a sentence; empty if none."""
+    """Calibration proposed by a tracker and not yet accepted, as a sentence; empty if none."""
 
 
 class LoopHealth(Message):
@@ -75,17 +75,17 @@ class LoopHealth(Message):
     ticks: int
     """Number of ticks behind the figures."""
     lateness_p50: float
-    """Seconds late against the 50 Hz schedule."""
+    """Lateness against the 50 Hz schedule, s."""
     lateness_p99: float
     """99th percentile of the ticks' lateness, s."""
     lateness_max: float
     """Maximum lateness of a tick, s."""
     drops: int = 0
-    """Messages lost in bounded queues since the start."""
+    """Number of messages lost in bounded queues since the start."""
 
     @property
     def busy(self) -> str:
-        """That the daemon gets too little processor time, in words; empty while ticks are less than 20 ms late."""
+        """Warning that the daemon gets too little processor time; empty while ticks are less than 20 ms late."""
         if self.lateness_p99 <= 0.02:  # threshold of a late control tick, s: a whole period
             return ""
         return f"the computer is busy: control ticks come {self.lateness_p99 * 1e3:.0f} ms late; end other programs"
@@ -103,58 +103,57 @@ class RecorderHealth(Message):
     messages: int = 0
     """Messages since the start."""
     drops: int = 0
-    """Messages that are not in the log since the start."""
+    """Number of messages missing in the log since the start."""
     reason: Reason = Reason.OK
     """Why recording has stopped; OK while it has not."""
 
     @property
     def lost(self) -> str:
-        """That a recording has gaps, in words; empty for one that has none, or has ended."""
+        """Warning that a recording has gaps; empty for a complete or ended one."""
         if not (self.recording and self.drops):
             return ""
         return f"{self.drops} messages are missing in the log: the disk takes them too slowly"
 
 
 class LocalisationStatus(StrEnum):
-    """How much the pose in map is worth."""
+    """Reliability of the pose in map."""
 
     MAPPING = "mapping"
-    """The scans fit the map that grows with them."""
+    """The scans fit the map being built."""
     LOCALISED = "localised"
     """The scans fit the saved map."""
     DEGENERATE = "degenerate"
-    """Scans fit, but do not determine one direction, in which the pose is odometry."""
+    """Scans fit, but do not constrain one direction, in which the pose is odometry."""
     UNCERTAIN = "uncertain"
     """The pose in map is less certain than ``UNCERTAIN_DEVIATION``; see its covariance."""
     LOST = "lost"
     """Scans have not fitted for a while: the pose is odometry."""
     SEARCHING = "searching"
-    """The position on the saved map is being searched for; the pose is meaningless."""
+    """Localisation is searching for the pose on the saved map; the pose is meaningless."""
     OUTSIDE = "outside"
-    """Scans match no place on the saved map: the robot is outside it. The search continues."""
+    """Scans match no place in the saved map: the robot is outside it. The search continues."""
 
 
 UNCERTAIN_DEVIATION: Final = 0.1
-"""Standard deviation of the position in map beyond which it is uncertain, m: as far as robots keep from
-obstacles."""
+"""Standard deviation of the position in map above which it is uncertain, m: the usual clearance to obstacles."""
 PLACELESS: Final = frozenset({LocalisationStatus.SEARCHING, LocalisationStatus.OUTSIDE})
 """States whose pose in map is meaningless."""
 MATCHED: Final = frozenset(LocalisationStatus) - PLACELESS - {LocalisationStatus.LOST}
 """States in which the robot is on the map."""
 NO_PLACE: Final = PLACELESS | {LocalisationStatus.LOST}
-"""States whose pose must not be used for places."""
+"""States in which the pose must not be used as a place."""
 
 
 class OdometryUse(StrEnum):
     """Whether SLAM predicts the motion between scans by odometry."""
 
     NONE = "none"
-    """There is no odometry: scans alone."""
+    """No odometry: scans only."""
     USED = "used"
     MISSING = "missing"
-    """No finite odometry at the scans for a second: scans alone."""
+    """No finite odometry at the times of the scans for a second: scans only."""
     CONTRADICTED = "contradicted"
-    """Scans contradict it: scans alone, until both agree again."""
+    """Scans contradict odometry: scans only, until both agree again."""
 
 
 class SlamHealth(Message):
@@ -163,27 +162,27 @@ class SlamHealth(Message):
     standing: LocalisationStatus
     """Status of the localisation."""
     accepted: bool
-    """Whether the scan corrected the pose; otherwise odometry alone moved it."""
+    """Whether the scan corrected the pose; otherwise it followed odometry."""
     overlap: Annotated[float, Field(ge=0, le=1)]
-    """Share of the scan's points that fit the map."""
+    """Fraction of the scan's points that fit the map."""
     residual: Annotated[float, Field(ge=0)]
-    """Root mean square distance of those across the surfaces, m."""
+    """Root mean square distance of these points from the surfaces, m."""
     degeneracy: Annotated[float, Field(ge=0)]
     """Ratio of the eigenvalues of the scan's position information, smaller over larger; near 0 in a corridor."""
     direction: float
-    """Yaw in map along which it knows least, rad."""
+    """Least constrained direction, as a yaw in map, rad."""
     scans: Annotated[int, Field(ge=0)] = 0
-    """Scans taken in."""
+    """Number of processed scans."""
     keys: Annotated[int, Field(ge=0)] = 0
-    """Scans the map is made of."""
+    """Number of keyframes in the map."""
     closures: Annotated[int, Field(ge=0)] = 0
-    """Loops closed."""
+    """Number of loops closed."""
     rejected: Annotated[int, Field(ge=0)] = 0
-    """Rejected matches."""
+    """Number of rejected matches."""
     left_out: Annotated[int, Field(ge=0)] = 0
-    """Scans that were too tilted, empty, late or of another geometry."""
+    """Number of unusable scans: too tilted, empty, late or of another geometry."""
     drops: Annotated[int, Field(ge=0)] = 0
-    """Scans lost because the worker was too slow."""
+    """Number of scans lost because the worker was too slow."""
     offset: float | None = None
     """Lead of odometry over the scans (s), if significant."""
     odometry: OdometryUse = OdometryUse.NONE
@@ -194,19 +193,19 @@ class OdometryHealth(Message):
     """Sensors available to odometry of ``kind: fusion``; published on change and once a second."""
 
     slipping: bool
-    """The wheels do not hold the ground: they hardly count."""
+    """The wheels slip and are almost ignored."""
     disturbed: bool
-    """Headings are left out: something magnetic is near."""
+    """The compass is disturbed and its headings are ignored."""
     sources: tuple[str, ...]
-    """Sensors of the last second."""
+    """Sensors used in the last second."""
     north: float | None = None
-    """Yaw in odom of the compass's zero, rad; None until it was found."""
+    """Yaw of the compass's zero in odom, rad; None until it is found."""
     trim: float = 0.0
     """Estimated error of the wheels' curvature, rad/m."""
     left_out: Annotated[int, Field(ge=0)] = 0
-    """Readings that could not be used: late, twice, out of order, impossible or no number."""
+    """Number of unusable readings: late, repeated, out of order, impossible or not finite."""
     waiting: Annotated[int, Field(ge=0)] = 0
-    """Readings queued to be fused again, after a late reading or the onset of a doubt."""
+    """Number of readings to be fused again, after a late reading or the onset of a doubt."""
 
 
 class LinkMedium(StrEnum):
@@ -230,10 +229,10 @@ class LinkLevel(StrEnum):
 
 
 class LinkHealth(Message):
-    """Quality of the network link; that a station is lost shows by its silence, never here."""
+    """Quality of the network link. Silence, not this message, shows that a station has lost the link."""
 
     interface: str | None = None
-    """Checked interface, or None."""
+    """Checked interface; None if there is none."""
     medium: LinkMedium | None = None
     """Medium of the link."""
     level: LinkLevel
@@ -243,15 +242,15 @@ class LinkHealth(Message):
     raw_signal: float | None = None
     """Latest sample (dBm)."""
     noise: float | None = None
-    """Noise level, dBm, where the driver knows it."""
+    """Noise level, dBm, if the driver reports it."""
     bit_rate: float | None = None
     """Negotiated rate of a cable, bit/s."""
     receive_rate: float | None = None
-    """Payload since the last message, byte/s."""
+    """Payload received since the last message, byte/s."""
     send_rate: float | None = None
-    """As ``receive_rate``."""
+    """Payload sent since the last message, byte/s."""
     errors: Annotated[int, Field(ge=0)] = 0
-    """Damaged or dropped packets of both directions since the interface came up."""
+    """Number of damaged or dropped packets in both directions since the interface came up."""
 
 
 class HostHealth(Message):
@@ -266,20 +265,20 @@ class HostHealth(Message):
     temperature: float | None = None
     """Hottest thermal zone, degree Celsius."""
     frequency: float | None = None
-    """Present clock of the fastest core, Hz."""
+    """Current clock of the fastest core, Hz."""
     frequency_share: float | None = None
     """Currently permitted maximum clock of the cores, as a fraction of their maximum, 0..1."""
     throttled: bool = False
-    """Slowed down because of heat or supply voltage, now."""
+    """Whether heat or supply voltage currently slows the processor down."""
     memory_total: Annotated[int, Field(ge=0)]
-    """Bytes."""
+    """Total memory, bytes."""
     memory_available: Annotated[int, Field(ge=0)]
-    """Bytes that can be had without swapping."""
+    """Memory available without swapping, bytes."""
     disk_total: Annotated[int, Field(ge=0)]
-    """Bytes of the file system logs are written to."""
+    """Size of the file system of the logs, bytes."""
     disk_free: Annotated[int, Field(ge=0)]
-    """Bytes of it that are free for the daemon."""
+    """Free space on it for the daemon, bytes."""
     daemon_memory: Annotated[int, Field(ge=0)]
-    """Resident bytes of the daemon itself."""
+    """Resident memory of the daemon, bytes."""
     daemon_files: Annotated[int, Field(ge=0)]
-    """File descriptors the daemon has open."""
+    """Number of open file descriptors of the daemon."""

@@ -1,6 +1,6 @@
-"""Missions: steps that a robot executes in sequence, and steps that choose among others.
+"""Missions: steps that a robot executes in sequence, including steps that contain or choose others.
 
-Steps that contain others, and conditions, have the names of the nodes of behaviour trees (BehaviorTree.CPP, py_trees).
+Steps that contain others, and conditions, are named after the nodes of behaviour trees (BehaviorTree.CPP, py_trees).
 """
 
 from typing import Annotated, Final, Literal, Self
@@ -13,8 +13,9 @@ Coordinate = Annotated[float, Field(ge=-10_000, le=10_000)]
 Seconds = Annotated[float, Field(gt=0, le=86_400)]
 
 Policy = Literal["abort", "continue", "return"]
-"""After a step that failed: fail the step that contains it, or end the mission; continue with the next step; drive back
-to where the mission began, and end."""
+"""Reaction to a failed step: fail the containing step, or end the mission; continue with the next step; drive back to
+the start of the mission, and end.
+"""
 
 
 DAY_TIME: Final = r"([01]\d|2[0-3]):[0-5]\d"
@@ -22,13 +23,13 @@ PointName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$")]
 Percent = Annotated[float, Field(ge=0, le=100)]
 
 MOST_STEPS: Final = 500
-"""Maximum number of steps of a mission, nested ones included."""
+"""Maximum number of steps of a mission, including nested ones."""
 DEEPEST: Final = 8
 """Maximum depth of nested steps."""
 
 
 class Condition(Schema):
-    """A state of the robot; it holds if all its keys do. An unknown value does not hold."""
+    """A condition on the robot's state; true if all its keys are fulfilled. An unknown value is not fulfilled."""
 
     battery_below: Percent | None = None
     """Charge of the battery below this value, %"""
@@ -37,19 +38,19 @@ class Condition(Schema):
     after: Seconds | None = None
     """Time since the mission was started or resumed, s"""
     point: PointName | None = None
-    """A point of interest of this name is known"""
+    """Whether a point of interest of this name is known"""
     tags: Annotated[int, Field(ge=1, le=10_000)] | None = None
     """Minimum number of known tags"""
     obstacle: Seconds | None = None
-    """An obstacle has stopped the robot for this time, s"""
+    """Minimum duration of a stop by an obstacle, s"""
     zone: Name | None = None
-    """The robot's footprint reaches into the zone of this name"""
+    """Name of a zone that the robot's footprint overlaps"""
     time: Annotated[str, Field(pattern=rf"^{DAY_TIME}-{DAY_TIME}$")] | None = None
-    """The time of day (local, of the robot's computer) lies in this interval, as 22:00-06:30"""
+    """Interval of the time of day (local, of the robot's computer), as 22:00-06:30"""
     any_of: Annotated[tuple["Condition", ...], Field(min_length=1, max_length=16, strict=False)] | None = None
-    """At least one of these conditions holds"""
+    """Conditions; at least one must be fulfilled"""
     unless: "Condition | None" = None
-    """This condition does not hold"""
+    """Condition that is not fulfilled"""
 
     @model_validator(mode="after")
     def _says_something(self) -> Self:
@@ -63,7 +64,7 @@ class MissionStep(Schema):
 
     do: str
     retries: Annotated[int, Field(ge=0, le=20)] = 0
-    """How often it is tried again before it has failed"""
+    """Number of retries after a failure"""
     on_failure: Policy | None = None
     """Reaction to the failure; null: the reaction of the mission, or abort within another step"""
     limit: Seconds | None = None
@@ -75,37 +76,37 @@ class GoToStep(MissionStep):
 
     do: Literal["goto"]
     x: Coordinate
-    """Place in map, m"""
+    """Position x in map, m"""
     y: Coordinate
-    """In m"""
+    """Position y in map, m"""
     yaw: Coordinate
-    """In rad"""
+    """Heading in map, rad"""
     via: Annotated[tuple[tuple[Coordinate, Coordinate], ...], Field(max_length=32, strict=False)] = ()
-    """Places x, y to pass before"""
+    """Waypoints x, y before it"""
 
 
 class PointStep(MissionStep):
-    """Drive before a tag that the camera found, or to a place that was marked."""
+    """Drive in front of a tag that the camera found, or to a marked place."""
 
     do: Literal["goto_point"]
     point: PointName
     """Name of the point of interest"""
     distance: Annotated[float, Field(ge=0, le=5)] = 0.7
-    """Metres before a tag"""
+    """Distance in front of a tag, m"""
 
 
 class LookStep(MissionStep):
-    """Turn towards a place, where the robot stands."""
+    """Turn on the spot towards a place."""
 
     do: Literal["look"]
     x: Coordinate
-    """Place in map, m"""
+    """Position x in map, m"""
     y: Coordinate
-    """In m"""
+    """Position y in map, m"""
 
 
 class WaitStep(MissionStep):
-    """Stand."""
+    """Stand still."""
 
     do: Literal["wait"]
     seconds: Seconds
@@ -118,9 +119,9 @@ class ExploreStep(MissionStep):
     budget: Seconds | None = None
     """Time budget (s); null for the robot's setting"""
     home: bool = False
-    """Drive back to where the exploration began"""
+    """Drive back to the start of the exploration"""
     find: Annotated[int, Field(ge=1, le=10_000)] | None = None
-    """Look for tags on walls, too, and end when the map has so many"""
+    """Also search for tags on walls, and end when the map has this many"""
 
 
 class BehaviourStepOfMission(MissionStep):
@@ -134,13 +135,13 @@ class BehaviourStepOfMission(MissionStep):
 
 
 class FollowWallStep(MissionStep):
-    """Run a behaviour that follows a wall, for some metres."""
+    """Run a behaviour that follows a wall, for a distance."""
 
     do: Literal["follow_wall"]
     name: Name
     """Name of the behaviour in the robot's configuration"""
     distance: Annotated[float, Field(gt=0, le=10_000)]
-    """In m"""
+    """Distance, m"""
 
 
 class DockStep(MissionStep):
@@ -148,53 +149,53 @@ class DockStep(MissionStep):
 
     do: Literal["dock"]
     dock: Name | None = None
-    """Name of the dock in the robot's configuration; null if there is one only"""
+    """Name of the dock in the robot's configuration; null: the only dock"""
 
 
 class UndockStep(MissionStep):
-    """Leave a dock, back to its staging pose."""
+    """Leave a dock and return to its staging pose."""
 
     do: Literal["undock"]
     dock: Name | None = None
-    """Name of the dock; null if there is one only"""
+    """Name of the dock; null: the only dock"""
 
 
 class RecordStep(MissionStep):
-    """Leave a note in the log."""
+    """Write a note to the log."""
 
     do: Literal["record"]
     note: Annotated[str, Field(min_length=1, max_length=200)]
 
 
 class ReturnStep(MissionStep):
-    """Drive back to where the mission began."""
+    """Drive back to the start of the mission."""
 
     do: Literal["return"]
 
 
 class ConditionStep(MissionStep):
-    """Succeed if a condition holds, else fail."""
+    """Succeed if a condition is fulfilled, otherwise fail."""
 
     do: Literal["condition"]
     when: Condition
 
 
 class WaitUntilStep(MissionStep):
-    """Stand until a condition holds."""
+    """Stand still until a condition is fulfilled."""
 
     do: Literal["wait_until"]
     when: Condition
 
 
 class SequenceOfSteps(MissionStep):
-    """Do steps in sequence; fails with the first that fails."""
+    """Execute steps in sequence; fails with the first failed step."""
 
     do: Literal["sequence"]
     steps: "Steps"
 
 
 class FallbackStep(MissionStep):
-    """Do steps until one succeeds; fails if all fail."""
+    """Execute steps until one succeeds; fails if all fail."""
 
     do: Literal["fallback"]
     steps: "Steps"
@@ -208,7 +209,7 @@ class RepeatStep(MissionStep):
     times: Annotated[int, Field(ge=1, le=1_000_000)] | Literal["forever"] | None = None
     """Number of rounds; forever = until the mission is stopped, a watch fires or a step fails"""
     until: Condition | None = None
-    """Condition that ends it after a round; fails if it does not hold after `times` rounds"""
+    """Condition checked after every round that ends it; fails if unfulfilled after `times` rounds"""
 
     @model_validator(mode="after")
     def _ends(self) -> Self:
@@ -218,33 +219,33 @@ class RepeatStep(MissionStep):
 
 
 class BranchStep(MissionStep):
-    """Do one of two sequences of steps."""
+    """Execute one of two sequences of steps."""
 
     do: Literal["branch"]
     when: Condition
     then: "Steps"
-    """Steps if the condition holds"""
+    """Steps if the condition is fulfilled"""
     otherwise: Annotated[tuple["AnyStep", ...], Field(max_length=MOST_STEPS, strict=False)] = ()
-    """Steps if it does not"""
+    """Steps otherwise"""
 
 
 class MissionWatch(Schema):
-    """Interruption of a parallel step as soon as a condition holds."""
+    """Interruption of a parallel step as soon as a condition is fulfilled."""
 
     when: Condition
     then: "Steps"
     """Steps of the interruption"""
     after: Literal["resume", "end"] = "resume"
-    """Afterwards: begin the interrupted step again, or end the parallel step as done"""
+    """Afterwards: restart the interrupted step, or end the parallel step successfully"""
 
 
 class ParallelStep(MissionStep):
-    """Do steps in sequence while watching conditions."""
+    """Execute steps in sequence while watching conditions."""
 
     do: Literal["parallel"]
     steps: "Steps"
     watch: Annotated[tuple[MissionWatch, ...], Field(min_length=1, max_length=16, strict=False)]
-    """Watched conditions; the first has priority"""
+    """Watched conditions; the first has the highest priority"""
 
 
 AnyStep = Annotated[
@@ -292,7 +293,7 @@ class Mission(Schema):
 
 
 def blocks(node: "Mission | AnyStep") -> tuple[tuple[tuple[str | int, ...], tuple[AnyStep, ...]], ...]:
-    """Return the sequences of steps within a node, each with the keys that lead to it."""
+    """Return the sequences of steps within a node, each with its parent keys."""
     match node:
         case BranchStep():
             return (("then",), node.then), (("otherwise",), node.otherwise)

@@ -10,24 +10,24 @@ from monstertruck_schemas.base import Float64Array, Message, Pose2D, Schema
 from monstertruck_schemas.reasons import Reason
 
 Steering = Literal["front", "rear", "counter", "crab", "hybrid"]
-"""Which axles steer: one alone, both by opposite or by equal angles, or both freely."""
+"""Steering mode: one axle alone, both with opposite or equal angles, or both freely."""
 
 
 MAX_POSES: Final = 5000
-"""Poses of a path that is driven."""
+"""Maximum number of poses of a path."""
 MAX_COORDINATE: Final = 10_000.0
-"""Size of x and y, m, and of yaw, rad, in paths and goals."""
+"""Maximum magnitude of x and y (m) and of yaw (rad) in paths and goals."""
 MAX_RUNS: Final = 64
-"""Runs of a path that is driven: parts between two stops, where the direction changes, or crab begins or ends."""
+"""Maximum number of runs of a path: parts between two stops, where the direction changes, or crab starts or ends."""
 
 
 class Path(Message):
-    """Poses to be driven in order, expressed in ``frame``."""
+    """Poses to drive in order, in ``frame``."""
 
     poses: Float64Array
     """Shape (3 n,), row-major (x, y, yaw) rows: m, m, rad."""
     directions: Float64Array
-    """Shape (n,): +1 where the truck arrives forward, -1 backward; empty = all forward."""
+    """Shape (n,): +1 where the truck arrives forward, -1 backward; empty: all forward."""
     steering: tuple[Steering, ...] = ()
     """Steering mode on arrival at each of the n poses; empty for the tracker's setting. The poses' yaw is used only in
     the modes crab and hybrid; otherwise it follows from the path."""
@@ -40,7 +40,7 @@ class Path(Message):
     closed: bool = False
     """A closed path is a lap: it ends where it began."""
     halts: bool = False
-    """It only brings the robot to rest; once that is disarmed nothing is left of it to be followed."""
+    """Whether it only brings the robot to rest and is not resumed after disarming."""
     name: str = ""
     """Name of the path; empty if it has none."""
 
@@ -49,38 +49,38 @@ class AxleResponse(Schema):
     """Response of the axles to requests: assumed by a tracker, and estimated from the truck's turns."""
 
     dead_time: Annotated[float, Field(ge=0)]
-    """Assumed, from a request to the first movement of the wheels, s."""
+    """Assumed dead time from a request to the first movement of the wheels, s."""
     lag: Annotated[float, Field(ge=0)]
     """Assumed time constant of the axles after the dead time (s)."""
     delay: Annotated[float, Field(ge=0)]
-    """Estimated, dead time and lag together, s."""
+    """Estimated dead time plus lag, s."""
     deviation: Annotated[float, Field(ge=0)]
-    """Standard deviation of that, s."""
+    """Standard deviation of the estimate, s."""
     samples: Annotated[int, Field(ge=0)]
-    """Measured turns that the estimate rests on."""
+    """Number of measured turns behind the estimate."""
 
 
 class AxleDeviation(Schema):
-    """How one axle steers against its calibration, as a tracker has learnt it."""
+    """Deviation of one axle's steering from its calibration, learnt by a tracker."""
 
     axle: Literal["front", "rear"]
     """Axle that the values describe."""
     gain: float
-    """Angle for each requested angle."""
+    """Ratio of actual to requested angle."""
     gain_deviation: Annotated[float, Field(ge=0)]
-    """Standard deviation of that."""
+    """Standard deviation of the ratio."""
     trim: float
     """Angle when straight ahead is requested, rad, left positive."""
     trim_deviation: Annotated[float, Field(ge=0)]
-    """Standard deviation of that, rad."""
+    """Standard deviation of that angle, rad."""
     slip: float
-    """Angle lost for each m/s^2 of lateral acceleration, rad s^2/m."""
+    """Angle lost per lateral acceleration, rad s^2/m."""
     slip_deviation: Annotated[float, Field(ge=0)]
-    """Standard deviation of that, rad s^2/m."""
+    """Standard deviation of that loss, rad s^2/m."""
     samples: Annotated[int, Field(ge=0)]
-    """Compared pieces of motion that this rests on."""
+    """Number of compared pieces of motion."""
     servo_differs: bool
-    """Whether gain or trim certainly differs from the calibration."""
+    """Whether gain or trim differs significantly from the calibration."""
 
 
 class TrackerState(Message):
@@ -91,16 +91,16 @@ class TrackerState(Message):
     cross_track: float
     """Signed distance from the path, left positive, m."""
     heading_error: float
-    """Rad."""
+    """Heading error, rad."""
     along: Annotated[float, Field(ge=0)]
-    """Metres driven along the path."""
+    """Distance travelled along the path, m."""
     length: Annotated[float, Field(ge=0)]
-    """Metres of the whole path."""
+    """Length of the whole path, m."""
     outcome: Reason
     """DRIVING, GOAL_REACHED, PATH_LOST ..."""
     axles: AxleResponse | None = None
     steering: tuple[AxleDeviation, ...] = ()
-    """Front and rear axle; empty where nothing is steered."""
+    """Front and rear axle; empty without steering."""
     steering_differs: str = ""
     """Difference from the calibration, as a sentence; empty if none is known."""
 
@@ -110,15 +110,15 @@ class TaskState(Protocol):
 
     @property
     def number(self) -> int:
-        """Number of tasks of its kind since the start of the daemon."""
+        """Number of the task of its kind since the start of the daemon."""
 
     @property
     def source(self) -> str:
-        """Who requested it."""
+        """Source of the request."""
 
     @property
     def running(self) -> bool:
-        """Whether it has not ended."""
+        """Whether it is still running."""
 
     @property
     def activity(self) -> str:
@@ -126,7 +126,7 @@ class TaskState(Protocol):
 
     @property
     def outcome(self) -> Reason:
-        """DRIVING while it runs, then how it ended."""
+        """DRIVING while it runs, then the reason of its end."""
 
     @property
     def text(self) -> str:
@@ -134,14 +134,14 @@ class TaskState(Protocol):
 
     @property
     def elapsed(self) -> float:
-        """Seconds since it was started."""
+        """Seconds since its start."""
 
 
 class GoalPhase(StrEnum):
     """State of a goal."""
 
     IDLE = "idle"
-    """Nothing: there is none, or ``outcome`` says how the last one ended."""
+    """No goal, or the last one has ended with ``outcome``."""
     PLANNING = "planning"
     DRIVING = "driving"
     BACKING_OUT = "backing_out"
@@ -153,30 +153,30 @@ class GoalState(Message):
     """Progress towards a goal, in ``frame``."""
 
     number: Annotated[int, Field(ge=0)] = 0
-    """Number of goals accepted since the start."""
+    """Number of the goal since the start."""
     source: str = ""
-    """Who requested it."""
+    """Source of the goal."""
     goal: Pose2D | None = None
     phase: GoalPhase = GoalPhase.IDLE
     """Current phase."""
     outcome: Reason = Reason.OK
-    """DRIVING while it is pursued, then GOAL_REACHED, CANCELLED, or why it was given up."""
+    """DRIVING while it runs, then GOAL_REACHED, CANCELLED, or the reason for giving up."""
     text: str = ""
     """The outcome in words."""
     waypoints: Annotated[int, Field(ge=0)] = 0
-    """Still to be passed."""
+    """Remaining waypoints."""
     remaining: Annotated[float, Field(ge=0)] = 0.0
     """Remaining length of the current path (m)."""
     elapsed: Annotated[float, Field(ge=0)] = 0.0
-    """Seconds spent on it, excluding pauses."""
+    """Time spent on it, excluding pauses, s."""
     routes: Annotated[int, Field(ge=0)] = 0
     """Number of routes so far, including the current one."""
     recoveries: Annotated[int, Field(ge=0)] = 0
-    """Recovery behaviours run so far."""
+    """Number of recovery behaviours so far."""
 
     @property
     def running(self) -> bool:
-        """Whether it has not ended."""
+        """Whether it is still running."""
         return self.phase is not GoalPhase.IDLE
 
     @property
@@ -186,14 +186,14 @@ class GoalState(Message):
 
 
 DOCK: Final = "dock"
-"""Kind of the behaviour that docks: while it runs, every image is searched for tags."""
+"""Kind of the docking behaviour: while it runs, every image is searched for tags."""
 
 
 class DockTarget(Schema):
-    """Dock that a behaviour drives to or away from."""
+    """Dock that a behaviour approaches or leaves."""
 
     name: str
-    """Its name in the configuration"""
+    """Name of the dock in the configuration"""
     pose: Pose2D
     """Pose of base at the dock, turned to face it, in the ``frame`` of odometry"""
 
@@ -202,29 +202,29 @@ class BehaviourState(Message):
     """Progress of a behaviour, in the ``frame`` of odometry."""
 
     number: Annotated[int, Field(ge=0)] = 0
-    """Number of behaviours started since the start of the daemon."""
+    """Number of the behaviour run since the start of the daemon."""
     behaviour: str = ""
-    """Its name in the configuration."""
+    """Name of the behaviour in the configuration."""
     kind: str = ""
     """Kind of the behaviour."""
     source: str = ""
-    """Who started it."""
+    """Source that started it."""
     running: bool = False
     """Whether it runs now."""
     phase: str = ""
     """Current phase; each kind has its own names."""
     outcome: Reason = Reason.OK
-    """DRIVING while it runs, then BEHAVIOUR_DONE, CANCELLED, or why it stopped."""
+    """DRIVING while it runs, then BEHAVIOUR_DONE, CANCELLED, or the reason why it stopped."""
     text: str = ""
     """The outcome in words."""
     elapsed: Annotated[float, Field(ge=0)] = 0.0
     """Seconds since it was started."""
     travelled: Annotated[float, Field(ge=0)] = 0.0
-    """Metres by odometry since it was started."""
+    """Distance travelled by odometry since its start, m."""
     values: dict[str, float] = Field(default_factory=dict)
-    """Measurements of its kind, such as the distance from a wall, m."""
+    """Measurements of this kind of behaviour, such as the distance from a wall, m."""
     dock: DockTarget | None = None
-    """Dock near which the gate lets the robot drive, while it runs."""
+    """Dock near which the gate lets the robot drive during the behaviour."""
 
     @property
     def activity(self) -> str:
@@ -236,42 +236,42 @@ class ExplorationPhase(StrEnum):
     """State of an exploration."""
 
     IDLE = "idle"
-    """Nothing: there is none, or ``outcome`` says how the last one ended."""
+    """No exploration, or the last one has ended with ``outcome``."""
     LOOKING = "looking"
-    """It stands and decides where to look next."""
+    """The robot stands and selects the next target."""
     DRIVING = "driving"
     LOST = "lost"
-    """It stands, for its place in the map is not known."""
+    """The robot stands because its pose in the map is unknown."""
     RETURNING = "returning"
     SAVING = "saving"
-    """It waits until the map is saved."""
+    """The robot waits until the map is saved."""
 
 
 class ExplorationState(Message):
     """Progress of an exploration, in ``frame``."""
 
     number: Annotated[int, Field(ge=0)] = 0
-    """Number of explorations since the start of the daemon."""
+    """Number of the exploration since the start of the daemon."""
     kind: str = ""
     """Kind of the explorer."""
     source: str = ""
-    """Who requested it."""
+    """Source of the request."""
     phase: ExplorationPhase = ExplorationPhase.IDLE
     """Current phase."""
     outcome: Reason = Reason.OK
-    """DRIVING while it runs, then EXPLORED, BUDGET_SPENT, CHARGE_SPENT, CANCELLED, or why it was given up."""
+    """DRIVING while it runs, then EXPLORED, BUDGET_SPENT, CHARGE_SPENT, CANCELLED, or the reason for giving up."""
     text: str = ""
     """Outcome in words; the awaited condition while it runs."""
     target: Pose2D | None = None
     """Current target."""
     frontiers: Annotated[int, Field(ge=0)] = 0
-    """Frontiers that can be reached."""
+    """Number of reachable frontiers."""
     left_alone: Annotated[int, Field(ge=0)] = 0
-    """Frontiers on the blacklist."""
+    """Number of frontiers on the blacklist."""
     known: Annotated[float, Field(ge=0)] = 0.0
     """Area of the free ground in the map, m^2."""
     travelled: Annotated[float, Field(ge=0)] = 0.0
-    """Metres since it was started."""
+    """Distance travelled since the start, m."""
     elapsed: Annotated[float, Field(ge=0)] = 0.0
     """Seconds since it was started."""
     home: Annotated[float, Field(ge=0)] | None = None
@@ -279,11 +279,11 @@ class ExplorationState(Message):
     goals: Annotated[int, Field(ge=0)] = 0
     """Number of targets so far."""
     failures: Annotated[int, Field(ge=0)] = 0
-    """Number of these whose place was not reached."""
+    """Number of targets that were not reached."""
     find: Annotated[int, Field(ge=1)] | None = None
-    """Number of tags to find; None to explore only."""
+    """Number of tags to find; None without tags."""
     found: Annotated[int, Field(ge=0)] = 0
-    """Tags in the map."""
+    """Number of tags in the map."""
 
     @property
     def running(self) -> bool:
@@ -306,18 +306,18 @@ class MissionLine(Schema):
     text: str
     """Step in words."""
     active: bool = False
-    """Whether the current step is this one or within it"""
+    """Whether it is, or contains, the current step"""
 
 
 class MissionState(Message):
     """Progress of a mission."""
 
     number: Annotated[int, Field(ge=0)] = 0
-    """Number of missions since the start of the daemon."""
+    """Number of the mission since the start of the daemon."""
     name: str = ""
     """Name of the mission."""
     source: str = ""
-    """Who requested it."""
+    """Source of the request."""
     running: bool = False
     """Whether it runs now."""
     resumable: bool = False
@@ -327,19 +327,19 @@ class MissionState(Message):
     steps: Annotated[int, Field(ge=0)] = 0
     """Number of steps, nested steps not counted."""
     node: str = ""
-    """Position of the current step among those within others, such as 2.1"""
+    """Position of the current step within nested steps, such as 2.1"""
     lines: tuple[MissionLine, ...] = ()
     """Steps around the current one"""
     doing: str = ""
-    """Current step in words."""
+    """Description of the current step."""
     attempt: Annotated[int, Field(ge=0)] = 0
     """Attempt at the current step, counted from 1."""
     failures: Annotated[int, Field(ge=0)] = 0
-    """Steps that have failed so far."""
+    """Number of failed steps so far."""
     failed: str = ""
-    """Why the last attempt at a step failed."""
+    """Failure of the last attempt at a step."""
     outcome: Reason = Reason.OK
-    """DRIVING while it runs, then MISSION_DONE, CANCELLED, or why it ended."""
+    """DRIVING while it runs, then MISSION_DONE, CANCELLED, or the reason of its end."""
     text: str = ""
     """Outcome in words; the condition awaited by the current step while it runs."""
     elapsed: Annotated[float, Field(ge=0)] = 0.0
@@ -352,9 +352,9 @@ class MissionState(Message):
 
 
 class StabiliserCommand(Message):
-    """Joint angles the lidar's mount has to take, see ``sensor.StabiliserFeedback`` for order and signs."""
+    """Commanded joint angles of the lidar's mount; see ``sensor.StabiliserFeedback`` for order and signs."""
 
     pitch: float
-    """Rad, nose down positive."""
+    """Pitch, rad, nose down positive."""
     roll: float
-    """Rad, right side down positive."""
+    """Roll, rad, right side down positive."""

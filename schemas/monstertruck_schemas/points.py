@@ -1,4 +1,4 @@
-"""Points of interest: found by the camera in the map, or marked there by an operator."""
+"""Points of interest: found by the camera in the map, or marked by an operator."""
 
 import math
 from enum import StrEnum
@@ -17,9 +17,9 @@ class PointKind(StrEnum):
     """Origin of a point of interest."""
 
     TAG = "tag"
-    """An AprilTag that the camera saw."""
+    """An AprilTag detected by the camera."""
     MARK = "mark"
-    """An operator."""
+    """A mark of an operator."""
 
 
 class PointOfInterest(Schema):
@@ -32,28 +32,28 @@ class PointOfInterest(Schema):
     tag: Annotated[int, Field(ge=0)] | None = None
     """Number of the tag."""
     x: float
-    """m; of a tag its middle."""
+    """Position, m; of a tag its centre."""
     y: float
     """m; of a tag its middle."""
     z: float = 0.0
-    """Over the ground, m."""
+    """Height above the ground, m."""
     yaw: float
-    """Rad; of a tag the direction that it faces, of a mark as it was given."""
+    """Yaw, rad; of a tag the direction it faces, of a mark as given."""
     covariance: Covariance
-    """Shape (9,), row-major, of (x, y, yaw): m^2, m rad, rad^2; against the map around it."""
+    """Covariance of (x, y, yaw) relative to the surrounding map, shape (9,), row-major: m^2, m rad, rad^2."""
     sightings: Annotated[int, Field(ge=0)] = 0
-    """Pictures that it was read from."""
+    """Number of images in which it was detected."""
     size: float | None = None
     """Side of the tag's black square, m."""
     first: Nanoseconds
-    """When it was seen, or marked, first."""
+    """Time of the first detection, or of the mark."""
     last: Nanoseconds
-    """When it was seen, or marked, last."""
+    """Time of the latest detection, or of the mark."""
     picture: bool = False
-    """There is one: remote call ``point_picture``."""
+    """Whether an image exists: remote call ``point_picture``."""
 
     def before(self, distance: float) -> Pose2D:
-        """Viewing pose of a robot: at this distance (m) in front of a tag; a mark is itself the place."""
+        """Viewing pose of a robot: at this distance (m) in front of a tag; for a mark, the mark itself."""
         if self.kind is PointKind.MARK:
             return Pose2D(x=self.x, y=self.y, yaw=self.yaw)
         x, y = self.x + distance * math.cos(self.yaw), self.y + distance * math.sin(self.yaw)
@@ -72,7 +72,7 @@ class TagPose(Schema):
     z: float
     """Height above base (m)."""
     yaw: float
-    """Direction that it faces (rad)."""
+    """Direction it faces (rad)."""
     covariance: Covariance
     """Shape (9,), row-major, of (x, y, yaw): m^2, m rad, rad^2."""
 
@@ -97,12 +97,12 @@ class PointOrder(StrEnum):
 
 
 class PointRequest(Request):
-    """Mark a place, or have a point of interest forgotten."""
+    """Mark a place, or remove a point of interest."""
 
     order: PointOrder
     name: PointName
     x: Coordinate | None = None
-    """Place of a mark in map, m; None = where the robot is."""
+    """Position of a mark in map, m; None: the robot's."""
     y: Coordinate | None = None
     yaw: Coordinate | None = None
-    """Yaw (rad); None for the robot's yaw."""
+    """Yaw (rad); None: the robot's."""

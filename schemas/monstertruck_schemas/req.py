@@ -1,8 +1,8 @@
-"""Messages of the ``req`` group, the only way into the robot.
+"""Messages of the ``req`` group, the only input of the robot.
 
-The key of every request names its source. The request has a role, carries the robot's nonce (published in
-``state/gate``, new at every start, so that no recorded request can move another run), a sequence number that must grow
-for each source, and a lease: its validity without a newer request. Trust in clocks is not needed.
+The key of every request names its source. A request has a role, carries the robot's nonce (published in ``state/gate``,
+new at every start, so that a recorded request cannot move another run), a sequence number that must increase for each
+source, and a lease: its validity without a newer request. No clock has to be trusted.
 """
 
 import math
@@ -17,7 +17,7 @@ from monstertruck_schemas.plan import Path
 
 
 class Role(StrEnum):
-    """Who asks; priority falls in this order."""
+    """Role of the sender; priority decreases in this order."""
 
     ESTOP = "estop"
     HAND = "hand"
@@ -32,18 +32,19 @@ class Request(Message):
     """Header of every request."""
 
     source: Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.@:-]+$")]
-    """Name of the asking program or person, shown to everybody; the daemon replaces it by the one in the key."""
+    """Name of the requesting program or person, visible to everyone; the daemon replaces it by the name in the key."""
     role: Role
     """Role of the sender, which gives its priority."""
     lease: Annotated[float, Field(gt=0, le=2.0)]
-    """Seconds this request stands; the gate caps it by its own limit for the role."""
+    """Lease, s; the gate limits it by the maximum for the role."""
     nonce: Annotated[str, Field(max_length=64)]
     """The robot's nonce from ``state/gate``."""
     gate_stamp: Nanoseconds | None = None
     """Stamp of the latest ``state/gate`` known to the sender, on the robot's clock. A request for motion must carry a
-    recent one, so that a delayed request moves nothing."""
+    recent one, so that a delayed request moves nothing.
+    """
     instance: Annotated[str, Field(max_length=32)] | None = None
-    """Random name of this run of the sender's program: while its lease runs, no other program takes over its source."""
+    """Random name of this run of the sender's program: during its lease no other program can take over its source."""
 
     @property
     def program(self) -> tuple[str, str | None]:
@@ -77,10 +78,10 @@ class RequestedTwist(Schema):
 
 
 class DriveRequest(Request):
-    """A requested motion, in one form: speed and axle angles, ``twist``, or ``shafts``.
+    """A requested motion in one form: speed and axle angles, ``twist``, or ``shafts``.
 
-    Non-finite numbers reach the gate, which refuses them by name. A reader that does not know the form sees a request
-    for standstill.
+    Non-finite numbers are sent to the gate, which refuses them by name. A reader that does not know the form interprets
+    it as a request for standstill.
     """
 
     speed: AnyNumber
@@ -90,13 +91,13 @@ class DriveRequest(Request):
     rear: AnyNumber = 0.0
     """Rear axle angle of the equivalent bicycle, rad, left positive (counter-steer: opposite to front)."""
     twist: RequestedTwist | None = None
-    """Velocity of the base; speed and angles are 0 then."""
-    # 8: rates that a request may have; a robot has four driven shafts at most, and refuses another number than its own
+    """Velocity of the base; speed and angles are then 0."""
+    # 8: maximum number of rates in a request; a robot has at most four driven shafts, and refuses any other number than
+    # its own
     shafts: Annotated[tuple[AnyNumber, ...], Field(min_length=1, max_length=8)] | None = None
-    """Rate of the wheels on every driven shaft in the body's order, rad/s, forward positive; speed and angles are 0
-    then."""
+    """Wheel rate of every driven shaft in the body's order, rad/s, forward positive; speed and angles are then 0."""
     unseen: bool = False
-    """The operator holds a second control to drive into ground that no sensor has seen; planners cannot."""
+    """Whether the operator holds a second control to drive into ground that no sensor has seen; planners cannot."""
 
     @model_validator(mode="after")
     def _one_form(self) -> Self:
@@ -109,7 +110,7 @@ class DriveRequest(Request):
 
     @property
     def form(self) -> DriveForm:
-        """How it describes the motion."""
+        """Form of the motion."""
         if self.shafts is not None:
             return DriveForm.SHAFTS
         return DriveForm.AXLES if self.twist is None else DriveForm.TWIST
@@ -125,24 +126,24 @@ class DriveRequest(Request):
 
     @property
     def pace(self) -> float:
-        """Speed of the base, m/s, negative = reverse; 0 for turning on the spot, and for shafts."""
+        """Speed of the base, m/s, negative: reverse; 0 when turning on the spot, and for shafts."""
         if self.twist is None:
             return self.speed
         return math.copysign(math.hypot(self.twist.vx, self.twist.vy), self.twist.vx)
 
     @property
     def neutral(self) -> bool:
-        """Whether it asks for standstill."""
+        """Whether it requests standstill."""
         if self.shafts is not None:
             speeds = self.shafts
         else:
             speeds = (self.speed,) if self.twist is None else (self.twist.vx, self.twist.vy, self.twist.wz)
-        # 1e-3: a request below this in all its speeds, m/s and rad/s, is for standstill
+        # 1e-3: a request below this in all its speeds, m/s and rad/s, means standstill
         return all(abs(speed) < 1e-3 for speed in speeds)
 
 
 class Order(StrEnum):
-    """Control requests to the gate; each is a remote call, too."""
+    """Control requests to the gate; each is also a remote call."""
 
     ARM = "arm"
     DISARM = "disarm"
@@ -150,21 +151,22 @@ class Order(StrEnum):
     RESET = "reset"
     STOP = "stop"
     ASK = "ask"
-    """Ask the operator who drives to hand over; changes nothing by itself."""
+    """Request control from the driving operator; has no other effect."""
     HAND_OVER = "hand_over"
-    """The driving operator hands over to an operator who has asked."""
+    """The driving operator hands over to an operator who has requested control."""
 
 
 STARTING: Final = frozenset({Order.ARM, Order.RESET})
 """Orders that permit motion: they must carry a recent gate stamp."""
 
 UNCONDITIONAL: Final = frozenset({Order.ESTOP, Order.STOP})
-"""Orders that the gate takes at any rate and whatever they say of themselves: stopping is always safe. They are sent by
-topic, ahead of all calls."""
+"""Orders that the gate always accepts, whatever their header: stopping is always safe. They are sent by topic, ahead of
+all calls.
+"""
 
 
 class ControlRequest(Request):
-    """Arm, disarm, emergency stop, its reset, give up driving, ask for it, or hand it over."""
+    """Arm, disarm, emergency stop, its reset, stop, request control, or hand over."""
 
     order: Order
     """Requested action."""
@@ -172,33 +174,34 @@ class ControlRequest(Request):
     """With an order to arm: planners do not drive until the truck is armed without it."""
     calibrates: bool = False
     """With an order to arm: sensors are calibrated on ground that an operator keeps clear. Until the robot is disarmed,
-    measures of motion that disagree, and ground that no sensor has seen, slow it instead of stopping it."""
+    contradicting motion measurements and ground that no sensor has seen slow it instead of stopping it.
+    """
     to: Annotated[str, Field(max_length=64)] | None = None
     """Source that may drive after a hand-over."""
 
 
 class Verb(StrEnum):
-    """Request to a task server; the orders of every kind of task map to these."""
+    """Order to a task server; the orders of every kind of task map to these."""
 
     START = "start"
     RESUME = "resume"
-    """Go on after a pause."""
+    """Continue after a pause."""
     PAUSE = "pause"
     STOP = "stop"
 
     @property
     def moves(self) -> bool:
-        """Whether the robot may drive off for it."""
+        """Whether the robot may start to drive because of it."""
         return self in (Verb.START, Verb.RESUME)
 
 
 class Waypoint(Schema):
-    """A place to pass on the way to a goal."""
+    """A waypoint on the way to a goal."""
 
     x: float
-    """M."""
+    """Position x, m."""
     y: float
-    """M."""
+    """Position y, m."""
     yaw: float | None = None
     """Yaw (rad); None to follow the path."""
 
@@ -208,16 +211,16 @@ class GoalRequest(Request):
 
     goal: Pose2D
     waypoints: Annotated[tuple[Waypoint, ...], Field(max_length=32)] = ()
-    """Passed in this order before it."""
+    """Waypoints, passed in this order."""
 
     @property
     def verb(self) -> Verb:
-        """Request to the task server."""
+        """Request to a task server."""
         return Verb.START
 
     @property
     def own(self) -> bool:
-        """Whether it is meant for a task of the same program only."""
+        """Whether it applies only to a task of the same program."""
         return False
 
 

@@ -314,10 +314,10 @@ def test_a_truck_that_somebody_has_armed_is_left_alone(tmp_path: Path):
             await LocalOperator(rig.daemon, clock).arm()
             await clock.sleep(0.2)
             truck, panel = LocalTruck(rig.daemon, clock), SimulatedOperator(rig, np.random.default_rng(1))
-            with pytest.raises(RequestRefusedError, match="armed already") as refusal:
+            with pytest.raises(RequestRefusedError, match="already armed") as refusal:
                 await calibrate(DriveWizard(), truck, panel, clock, config, {})
             assert refusal.value.refusal is Reason.BUSY
-            with pytest.raises(RequestRefusedError, match="while it is disarmed"):
+            with pytest.raises(RequestRefusedError, match="disarm it before saving"):
                 await truck.call("calibration_undo", {"wizard": "drive"})
 
     run_virtual(main)

@@ -116,7 +116,7 @@ async def test_scripted_shown_undone_and_applied_by_the_next_start(tmp_path: Pat
             pass
         unanswered = await command(truck, "drive", "--yes", "--sign-only")
         assert unanswered.returncode == Reason.BAD_INPUT.exit_code
-        assert "forward: no answer on standard input; give it by --answer forward=VALUE" in unanswered.stderr
+        assert "forward: no answer on standard input; pass --answer forward=VALUE" in unanswered.stderr
         assert unanswered.stdout == ""
         refused = await command(truck, "battery", "--answer", "meter=240")
         assert refused.returncode == Reason.BAD_INPUT.exit_code
@@ -130,7 +130,7 @@ async def test_scripted_shown_undone_and_applied_by_the_next_start(tmp_path: Pat
         shown = await command(truck, "show")
         assert shown.returncode == 0
         assert "battery.gain" in shown.stdout
-        assert "the daemon still runs on no calibration: restart it" in shown.stderr
+        assert "the daemon still uses no calibration: restart it" in shown.stderr
         assert await end(truck.daemon) == 0
         await truck.start_daemon()
         async with truck.client() as client:

@@ -72,10 +72,10 @@ async def test_what_hangs_on_no_line_is_probed_without_one(device: str, expected
 
 async def test_a_probe_that_needs_a_port_and_an_emulator_that_needs_none_say_so(tmp_path: Path):
     probed = await command("probe", "lidar")
-    assert (probed.returncode, probed.stderr) == (3, "lidar: give its port with --port\n")
+    assert (probed.returncode, probed.stderr) == (3, "lidar: pass its port with --port\n")
     emulated = await command("emulate", "host", "--link", str(tmp_path / "host"))
     assert emulated.returncode == 3
-    assert "no device on a port" in emulated.stderr
+    assert "not a device on a port" in emulated.stderr
 
 
 async def test_the_demo_drives_prints_and_leaves_log_and_picture(tmp_path: Path):

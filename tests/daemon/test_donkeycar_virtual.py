@@ -23,7 +23,12 @@ CAR = Path(__file__).resolve().parents[2] / "configs" / "robots" / "donkeycar.ya
 def test_it_drives_its_bend_and_shows_pictures_without_a_map():
     config = load_config(CAR, SimulatedTruckConfig)[0].model_copy(update={"recorder": None})
     assert config.devices.lidar is config.slam is None
-    for weakness in ("a PCA9685 has no watchdog", "nothing measures the motor", "gate.attitude null", "scan.critical"):
+    for weakness in (
+        "a PCA9685 has no watchdog",
+        "no sensor measures the motor",
+        "gate.attitude null",
+        "scan.critical",
+    ):
         assert any(weakness in text for text in config.weakened()), weakness
 
     async def main(clock: VirtualClock) -> None:

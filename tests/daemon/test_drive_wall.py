@@ -204,7 +204,7 @@ async def _orders(endpoint: str) -> None:
     silent = await command("echo", "sensor/drive_4", "--timeout", "3", "--endpoint", endpoint)
     assert silent.returncode == Reason.TIMEOUT.exit_code
     assert silent.stderr.splitlines() == [
-        "robot 'truck' is there but publishes no sensor/drive_4 yet; waiting",
+        "robot 'truck' is running but does not publish sensor/drive_4 yet; waiting",
         "no message of sensor/drive_4 within 3 s",
     ]
 

@@ -221,7 +221,7 @@ def test_far_from_home_it_turns_back_while_the_charge_suffices(tmp_path: Path):
 
     _, truth = run_scenario(scenario, tmp_path, explorer={"full_range": 3.0})
     assert ends[0].outcome is Reason.CHARGE_SPENT
-    assert "are kept for" in ends[0].text
+    assert "are reserved for" in ends[0].text
     assert "back at the start" in ends[0].text
     assert not truth[:, 5].any()
     assert math.dist(truth[-1, 1:3], truth[0, 1:3]) < 0.2

@@ -220,7 +220,7 @@ def test_a_goal_ends_the_path_that_is_followed_whether_it_is_refused_or_not(tmp_
         await LocalDriver(trip).path(path)
         await trip.clock.sleep(1.0)
         assert (await trip.end()).outcome is Reason.GOAL_BLOCKED
-        assert (await trip.end()).text == "another path is followed now"
+        assert (await trip.end()).text == "the tracker follows another path"
         await trip.goal(1.8, 3.9, 0.0)
         await trip.arm()
         assert (await trip.end()).outcome is Reason.GOAL_REACHED

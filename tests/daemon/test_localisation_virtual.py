@@ -64,7 +64,7 @@ def test_a_damaged_save_is_named_and_the_one_before_is_read_if_it_is_whole(tmp_p
     (slam,) = said
     if harmed == 1:
         (text,) = {event.text for event in drive.events if event.reason is Reason.FILE_DAMAGED}
-        assert text.endswith("expected 1138 as in manifest.json; an older save is read")
+        assert text.endswith("expected 1138 as in manifest.json; an older save is loaded instead")
         assert drive.health
         assert (slam.state, slam.reason) == (ServiceState.READY, Reason.FILE_DAMAGED)
     else:
@@ -108,7 +108,7 @@ def test_a_goal_ends_when_the_truck_is_carried_to_where_it_does_not_know_its_pla
         await trip.clock.sleep(0.5)
         trip.rig.world.carry(trip.clock.now(), (6.85, 5.6, 1.57))
         end = await trip.end(20.0)
-        assert (end.outcome, end.text) == (Reason.POSE_LOST, "its place on the saved map is not known (searching)")
+        assert (end.outcome, end.text) == (Reason.POSE_LOST, "its pose on the saved map is unknown (searching)")
 
     travel(story, slam={"mode": "localisation", "map": CONFIGS / "worlds" / "rooms.yaml"})
 

@@ -99,7 +99,7 @@ def test_a_tricycle_names_a_stuck_encoder_and_drives_on_without_it_and_without_b
                 reported = {event.reason: event.text for event in events.drain()}
             assert lap.outcome is Reason.GOAL_REACHED
             assert lap.stops == ()
-            assert "left is stuck; right and steering carry on" in reported[Reason.ENCODERS_DISAGREE]
+            assert "left is stuck; odometry uses right and steering" in reported[Reason.ENCODERS_DISAGREE]
             assert Reason.DEVICE_LOST in reported
             assert sources == [("encoders", "drive")] * 3 + [("drive", "steering")]
             assert odometry.latest is not None

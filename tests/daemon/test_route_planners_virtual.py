@@ -41,7 +41,9 @@ def test_a_goal_is_reached_over_a_waypoint(kind: str):
 
 def test_a_route_over_the_grid_without_a_local_planner_is_refused():
     async def story(trip: Trip) -> None:
-        with pytest.raises(RequestRefusedError, match=r"no motions of the robot: set planner\.local_planner"):
+        with pytest.raises(
+            RequestRefusedError, match=r"cannot drive this planner's routes directly: set planner\.local_planner"
+        ):
             await trip.goal(5.0, 3.9, 0.0)
 
     assert_at(travel(story, planner=settings("grid_astar", None)), 1.0, 3.95, 0.0)

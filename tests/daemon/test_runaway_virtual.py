@@ -110,7 +110,7 @@ def test_a_motor_that_nothing_stops_goes_on_stopping_and_the_order_says_so():
     assert outcome.event <= 0.5
     assert outcome.safe is None
     assert "standstill is not confirmed after 4 s" in outcome.answer
-    assert "a motor turns without an order" in outcome.answer
+    assert "a motor turns without a command" in outcome.answer
     assert outcome.stopping[1] >= 2.9
 
 

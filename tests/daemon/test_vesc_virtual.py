@@ -100,7 +100,7 @@ def test_a_car_with_a_speed_controller_without_feedback_drives_its_bend(tmp_path
     file = tmp_path / "car.yaml"
     file.write_text(ESC_CAR.format(robots=ROBOTS))
     config = load_config(file, SimulatedTruckConfig)[0].model_copy(update={"recorder": None})
-    assert any("nothing measures the motor" in text for text in config.weakened())
+    assert any("no sensor measures the motor" in text for text in config.weakened())
 
     async def main(clock: VirtualClock) -> None:
         rig = VirtualRig(config, clock)

@@ -1,1 +1,1 @@
-"""Microcontroller boards that speak the text protocol of ROSArduinoBridge."""
+"""Microcontroller boards with the text protocol of ROSArduinoBridge."""

@@ -1,4 +1,4 @@
-"""Settings of boards that speak ROSArduinoBridge."""
+"""Settings of boards with ROSArduinoBridge."""
 
 import math
 from typing import Annotated, Literal, Self
@@ -13,24 +13,25 @@ Seconds = Annotated[float, Field(gt=0)]
 
 
 class ArduinoBridgeConfig(Schema):
-    """Two motors with encoders on a microcontroller; the left one turns the body's first shaft."""
+    """Two motors with encoders on a microcontroller; the left one drives the body's first shaft."""
 
     kind: Literal["arduino_bridge"] = "arduino_bridge"
     counts_per_turn: Annotated[int, Field(ge=4, le=1_000_000)] = 1440
-    """Encoder counts in one turn of the shaft; of the wheel where `geometry.drive_ratio` is 1"""
+    """Encoder counts per turn of the shaft; of the wheel if `geometry.drive_ratio` is 1"""
     pid_rate: Annotated[float, Field(gt=0, le=1000)] = PID_RATE
-    """Periods of its speed controller in a second (`PID_RATE` of the firmware)"""
+    """Rate of its speed controller, Hz (`PID_RATE` of the firmware)"""
     inverted: Annotated[tuple[bool, bool], Field(strict=False)] = (False, False)
-    """Left and right: driving forward takes negative counts"""
+    """Left and right: whether driving forward needs negative counts"""
     max_rate: Annotated[float, Field(gt=0, le=1000)] = 10.0
-    """Requests are limited to this, rad/s"""
+    """Maximum motor rate, rad/s"""
     deceleration: Annotated[float, Field(gt=0)] = 20.0
-    """Deceleration by a lower set-point, as measured, rad/s^2"""
+    """Measured deceleration to a lower set-point, rad/s^2"""
     quick_deceleration: Annotated[float, Field(gt=0)] = 30.0
-    """Deceleration after `m 0 0`, which takes the motors' voltage at once, as measured, rad/s^2"""
+    """Measured deceleration after `m 0 0`, which removes the motors' voltage at once, rad/s^2"""
     auto_stop: Annotated[float, Field(ge=0.05, le=10)] = AUTO_STOP
     """Time without a set-point after which the board stops the motors (s, `AUTO_STOP_INTERVAL`). It is compiled into
-    the firmware and cannot be read: compile it with 250 ms, and enter that here"""
+    the firmware and cannot be read: compile it with 250 ms and enter the value here
+    """
     rate: Annotated[float, Field(ge=5, le=50)] = 20.0
     """Exchanges per second"""
     answer_timeout: Annotated[float, Field(gt=0, le=0.5)] = 0.1
@@ -38,16 +39,16 @@ class ArduinoBridgeConfig(Schema):
     command_timeout: Seconds = 0.25
     """Age of the latest command at which the motors stop (s)"""
     boot: Annotated[float, Field(ge=0, le=10)] = 3.0
-    """Longest time that a board takes to answer after its port was opened, s: most restart then"""
+    """Maximum time until a board answers after its port was opened, s: most boards restart then"""
 
     @property
     def shafts(self) -> int:
-        """How many driven shafts it serves."""
+        """Number of driven shafts."""
         return len(self.inverted)
 
     @property
     def turn(self) -> float:
-        """Angle of a count, rad."""
+        """Angle per count, rad."""
         return math.tau / self.counts_per_turn
 
     @property
@@ -57,7 +58,7 @@ class ArduinoBridgeConfig(Schema):
 
     @property
     def stop_words(self) -> str:
-        """Nothing: the stop script needs the port alone."""
+        """Empty: the stop script needs only the port."""
         return ""
 
     @model_validator(mode="after")

@@ -1,7 +1,7 @@
-"""Driver of a board that speaks ROSArduinoBridge: ``cmd/drive`` and ``cmd/drive_2`` in, encoder counts out.
+"""Driver of a board with ROSArduinoBridge: ``cmd/drive`` and ``cmd/drive_2`` in, encoder counts out.
 
-One exchange a cycle: the set-points of both motors go out, both counters come back. The first command of every session
-stops the motors, and so does the last one. In between every set-point feeds the board's own watchdog.
+One exchange per cycle sends the set-points of both motors and reads both counters. The first and the last command of
+every session stop the motors. Every set-point also feeds the board's watchdog.
 """
 
 import contextlib
@@ -38,7 +38,7 @@ def setpoint_of(commands: Sequence[DriveCommand | None], now: int, config: Ardui
     Args:
         commands: latest command of each shaft, if any.
         now: time, ns.
-        config: signs, limits and time-outs.
+        config: signs, limits and timeouts.
     """
     mode, known = requested(commands, now, config.command_timeout)
     if mode is DriveMode.DISABLED:
@@ -66,10 +66,12 @@ class ArduinoBridgeDriver(MotorBoard[ArduinoBridgeConfig, BoardSession]):
     ) -> None:
         super().__init__(config, port, clock, 2, events, name, ends)
         self._counts: list[int] = [0, 0]
-        """Counts accumulated over sessions and restarts of the board."""
-        averaged = 4  # readings averaged for a speed: one count is much of a slow wheel's turn per cycle
+        """Counts accumulated across sessions and restarts of the board."""
+        averaged = (
+            4  # number of readings averaged for a speed: one count is a large part of a slow wheel's turn per cycle
+        )
         self._readings: deque[tuple[Counts, int]] = deque(maxlen=averaged + 1)
-        """Latest counters of this session, with their instants."""
+        """Latest counters of this session with their times."""
 
     def _session(self, link: Link) -> BoardSession:
         return BoardSession(link, self._clock, self._config.answer_timeout)
@@ -78,11 +80,11 @@ class ArduinoBridgeDriver(MotorBoard[ArduinoBridgeConfig, BoardSession]):
         """See the base class.
 
         Raises:
-            WrongDeviceError: something else answers.
+            WrongDeviceError: another device answers.
         """
         self._readings.clear()
         await session.identify(self._config.boot)
-        self._events(Reason.DEVICE_READY, Severity.INFO, self.name, "board with ROSArduinoBridge")
+        self._events(Reason.DEVICE_READY, Severity.INFO, self.name, "board running ROSArduinoBridge")
 
     def _setpoint(self) -> BoardSetpoint:
         return setpoint_of(self._latest(), self._clock.now(), self._config)
@@ -106,7 +108,7 @@ class ArduinoBridgeDriver(MotorBoard[ArduinoBridgeConfig, BoardSession]):
         if self._readings:
             before, then = self._readings[-1]
             steps = [new - old for old, new in zip(before, counts, strict=True)]
-            overspeed = 3.0  # times the greatest rate: a shaft cannot have turned faster, so its counter was reset
+            overspeed = 3.0  # factor on the maximum rate: a larger step shows that the counter was reset
             most = overspeed * config.max_rate / config.turn * (stamp - then) / SECOND + 1
             if max(map(abs, steps)) > most:
                 text = f"{self._port.name}: counters jumped by {steps[0]} and {steps[1]}: the board has restarted"
@@ -131,7 +133,7 @@ class ArduinoBridgeDriver(MotorBoard[ArduinoBridgeConfig, BoardSession]):
 
     async def _make_safe(self, session: BoardSession) -> None:
         with contextlib.suppress(DeviceError, TimeoutError):
-            async with self._clock.deadline(0.3):  # seconds a session may take at its end to stop the motors
+            async with self._clock.deadline(0.3):  # seconds allowed at the end of a session to stop the motors
                 await session.exchange(speeds(0, 0))
                 await session.exchange(pwm(0, 0))
             return

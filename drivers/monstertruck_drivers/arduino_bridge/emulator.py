@@ -1,8 +1,8 @@
-"""The board's side of ROSArduinoBridge: lines in, lines out, a controller with whole counts, and its auto-stop.
+"""Device side of ROSArduinoBridge: text lines, a controller with whole counts, and its auto-stop.
 
-Habits of the real thing: it restarts when its port is opened, is deaf for a second and a half then, and counts from 0;
-takes damaged commands as they are, for there is no sum; holds whole counts for each period of its controller; stops the
-motors when set-points stop coming, after two seconds as published.
+Behaviour of the real board: it restarts when its port is opened, ignores input for 1.5 s, and then counts from 0. It
+executes damaged commands, because there is no checksum. It holds whole counts per period of its controller. It stops
+the motors when no set-points arrive, after two seconds as published.
 """
 
 import asyncio
@@ -32,7 +32,7 @@ class ArduinoBridgeEmulator(FaultyDevice):
 
     Args:
         clock: time.
-        plants: loads of the motors; free motors take the missing places.
+        plants: loads of the motors; missing ones are replaced by free motors.
         settings: counts, auto-stop.
     """
 
@@ -72,7 +72,7 @@ class ArduinoBridgeEmulator(FaultyDevice):
         self._drive()
 
     def power_cycle(self) -> None:
-        """Supply off and on, or the reset that opening its port gives it."""
+        """Switch the supply off and on, or reset the board as opening its port does."""
         boot = 1500 * MILLISECOND  # from a restart to the first answer: the boot loader waits for a new program
         self._restart(boot)
 
@@ -94,9 +94,9 @@ class ArduinoBridgeEmulator(FaultyDevice):
                     self._answer(end, self._obey(line))
 
     async def _watch(self) -> None:
-        """Stop the motors when set-points stop coming."""
+        """Stop the motors when no set-points arrive."""
         while True:
-            await self._clock.sleep(0.01)  # seconds between two looks at the auto-stop
+            await self._clock.sleep(0.01)  # seconds between two checks of the auto-stop
             if any(self._targets) and self._clock.now() - self._fed > self._config.auto_stop * SECOND:
                 self._targets = [0.0, 0.0]
                 self._drive()
@@ -133,7 +133,7 @@ class ArduinoBridgeEmulator(FaultyDevice):
         self._drive()
 
     def _drive(self) -> None:
-        """Ask the motors for their speeds."""
+        """Set the target speeds of the motors."""
         now = self._clock.now()
         for plant, target in zip(self._plants, self._targets, strict=True):
             wanted = target
@@ -160,13 +160,13 @@ class ArduinoBridgeEmulator(FaultyDevice):
 
 
 def _atoi(word: bytes) -> int:
-    """A number as C reads it: 0 where there is none."""
+    """Parse a number as C does: 0 if there is none."""
     sign, digits = (-1, word[1:]) if word.startswith(b"-") else (1, word)
     end = next((i for i, byte in enumerate(digits) if not 48 <= byte <= 57), len(digits))
     return sign * int(digits[: min(end, 9)] or b"0")
 
 
 def emulated(setup: EmulatorSetup) -> ArduinoBridgeEmulator:
-    """The board of a simulated robot's first two shafts, on a line of real speed."""
+    """Create the board of a simulated robot's first two shafts, on a line of realistic speed."""
     setup.port.device.baud = BOARD_BAUD
     return ArduinoBridgeEmulator(setup.clock, setup.physics.motors[:2], setup.settings)

@@ -1,8 +1,8 @@
-"""Lines of ROSArduinoBridge; standard library only, which the stop script needs.
+"""Text protocol of ROSArduinoBridge; standard library only, for the stop script.
 
 Source: Patrick Goebel and James Nugen, ``commands.h`` and ``ROSArduinoBridge.ino``. The host sends a letter and its
-arguments, one space apart, and a carriage return; the board answers every command by one line that ends with CR and LF,
-and sends nothing else. There is no checksum and no sequence number.
+arguments, separated by spaces, and a carriage return. The board answers every command by one line that ends with CR and
+LF, and sends nothing else. There is no checksum and no sequence number.
 
 ============== =========================================================== =================
 command        meaning                                                     answer
@@ -15,8 +15,8 @@ command        meaning                                                     answe
 ``b``          baud rate                                                   a number
 ============== =========================================================== =================
 
-Anything else is answered ``Invalid Command``. Without ``m`` or ``o`` for ``AUTO_STOP_INTERVAL``, 2000 ms as published,
-the board stops both motors. The interval is compiled in.
+Any other input is answered by ``Invalid Command``. Without ``m`` or ``o`` for ``AUTO_STOP_INTERVAL``, 2000 ms as
+published, the board stops both motors. The interval is compiled in.
 """
 
 import re
@@ -24,9 +24,9 @@ from typing import Final
 
 BOARD_BAUD: Final = 57_600
 PID_RATE: Final = 30.0
-"""Periods of the controller in a second, as published."""
+"""Rate of the controller as published, Hz."""
 AUTO_STOP: Final = 2.0
-"""Seconds, as published."""
+"""Auto-stop interval as published, s."""
 LONGEST_LINE: Final = 64
 OK: Final = b"OK"
 REFUSED: Final = b"Invalid Command"
@@ -51,7 +51,7 @@ END: Final = b"\r"
 
 
 def counts_of(line: bytes) -> tuple[int, int] | None:
-    """Return the counts of an answer to ``e``; None if it is none."""
+    """Parse the counts of an answer to ``e``; None if it is invalid."""
     match = _COUNTS.fullmatch(line)
     return None if match is None else (int(match[1]), int(match[2]))
 
@@ -62,14 +62,14 @@ def is_number(line: bytes) -> bool:
 
 
 class BoardLines:
-    """Cuts a stream of bytes into lines."""
+    """Splits a stream of bytes into lines."""
 
     def __init__(self, end: bytes = b"\n") -> None:
         self._end = end
         self._rest = bytearray()
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Return lines that became complete, without their ends; a line that never ends is dropped."""
+        """Return the completed lines without their ends; a line that never ends is dropped."""
         self._rest += data
         *lines, rest = bytes(self._rest).split(self._end)
         self._rest = bytearray(rest if len(rest) <= LONGEST_LINE else b"")

@@ -1,4 +1,4 @@
-"""Commands and answers, with a board over one open link; shared by the driver and `identify`."""
+"""Commands and answers of a board over one open link; shared by the driver and `identify`."""
 
 from monstertruck_drivers.arduino_bridge.config import ArduinoBridgeConfig
 from monstertruck_drivers.arduino_bridge.protocol import (
@@ -36,7 +36,7 @@ class BoardSession:
         self._heard = b""
 
     def send(self, *commands: bytes) -> None:
-        """Send commands whose answers are not waited for.
+        """Send commands without waiting for their answers.
 
         Raises:
             DeviceLostError: unplugged.
@@ -47,14 +47,14 @@ class BoardSession:
         """Stop the motors, and wait until the board answers.
 
         Args:
-            boot: seconds that it may take.
+            boot: maximum boot time, s.
 
         Raises:
             DeviceLostError: unplugged.
-            DeviceTimeoutError: silence.
-            WrongDeviceError: something else answers.
+            DeviceTimeoutError: the board is silent.
+            WrongDeviceError: another device answers.
         """
-        knock = 0.25  # seconds between two questions to a board that restarts
+        knock = 0.25  # seconds between two requests to a restarting board
         until = self._clock.now() + round(max(boot, knock) * SECOND)
         while self._clock.now() < until:
             self._forget()
@@ -64,16 +64,16 @@ class BoardSession:
                 return
         name = self._link.name
         if self._heard:
-            raise WrongDeviceError(f"{name}: {self._heard[:40]!r} is no answer of ROSArduinoBridge")
-        raise DeviceTimeoutError(f"{name}: silence; expected a board with ROSArduinoBridge")
+            raise WrongDeviceError(f"{name}: {self._heard[:40]!r} is not an answer of ROSArduinoBridge")
+        raise DeviceTimeoutError(f"{name}: silent; expected a board running ROSArduinoBridge")
 
     async def exchange(self, command: bytes) -> tuple[int, int]:
-        """Give a command and read both encoders.
+        """Send a command and read both encoders.
 
         Raises:
             DeviceLostError: unplugged.
-            DeviceTimeoutError: not both answers came in time.
-            ProtocolError: they are others.
+            DeviceTimeoutError: an answer is missing.
+            ProtocolError: an answer is invalid.
         """
         self._forget()
         self.asked = self._clock.now()
@@ -91,7 +91,7 @@ class BoardSession:
             self._lines = BoardLines()
 
     async def _collect(self, within: float, count: int) -> list[bytes]:
-        """Collect at most ``count`` lines within ``within`` seconds, without empty lines and refusals of noise."""
+        """Collect at most ``count`` lines within ``within`` seconds, ignoring empty lines and rejections of noise."""
         found: list[bytes] = []
         due = self._clock.now() + round(within * SECOND)
         while len(found) < count and (left := due - self._clock.now()) > 0:
@@ -108,10 +108,10 @@ async def identify(link: Link, clock: Clock, settings: ArduinoBridgeConfig) -> d
     """Read both counters; stopping the motors identifies the board.
 
     Returns:
-        JSON-able: ``counts`` left and right.
+        JSON-compatible: ``counts`` left and right.
 
     Raises:
-        DeviceError: as the driver's ``run``.
+        DeviceError: as for the driver's ``run``.
     """
     session = BoardSession(link, clock, settings.answer_timeout)
     await session.identify(settings.boot)

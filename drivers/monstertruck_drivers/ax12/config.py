@@ -1,4 +1,4 @@
-"""Configuration of the stabiliser's two joints: calibration, times and what to do after an alarm."""
+"""Configuration of the stabiliser's two joints: calibration, timing and recovery from alarms."""
 
 from typing import Annotated, Literal, Self
 
@@ -17,48 +17,48 @@ class JointConfig(Schema):
     id: Annotated[int, Field(ge=0, le=252)]
     """Id of the unit on its bus."""
     zero: Steps
-    """Position at joint angle 0."""
+    """Servo position at joint angle 0, steps."""
     min_position: Steps
     """Smallest position commanded (steps)."""
     max_position: Steps
     """Largest position commanded (steps)."""
     direction: Literal[-1, 1] = 1
-    """+1 where a rising position (shaft counter-clockwise) turns the joint positively (REP 103)."""
+    """+1 if a rising position (shaft counter-clockwise) turns the joint in the positive direction (REP 103)."""
 
     @model_validator(mode="after")
     def _zero_within_limits(self) -> Self:
         if not self.min_position < self.zero < self.max_position:
             raise ValueError(
-                f"min_position {self.min_position} < zero {self.zero} < max_position {self.max_position} does not hold"
+                f"expected min_position {self.min_position} < zero {self.zero} < max_position {self.max_position}"
             )
         return self
 
     def position(self, angle: float) -> int:
-        """Goal for a joint angle, rad, held within the limits."""
+        """Goal position for a joint angle (rad), within the limits."""
         steps = round(self.zero + self.direction * angle / STEP)
         return min(max(steps, self.min_position), self.max_position)
 
     def angle(self, position: float) -> float:
-        """Joint angle, rad, of a position in steps."""
+        """Joint angle for a position in steps, rad."""
         return (position - self.zero) * STEP * self.direction
 
 
 class AlarmConfig(Schema):
-    """When a joint that went limp is given torque again."""
+    """Recovery of a joint that lost its torque."""
 
     rest: Seconds = 3.0
-    """Seconds a joint rests after an alarm; doubled while it trips again."""
+    """Waiting time after an alarm, s; doubled if it trips again."""
     rest_max: Positive = 60.0
     """Maximum rest (s)."""
     settled_after: Positive = 30.0
     """Holding time that resets the next rest to ``rest`` (s)."""
     cool_below: Annotated[int, Field(ge=0, le=100)] = 60
-    """Degrees Celsius a joint must have reached."""
+    """Maximum temperature for switching the torque on again, degrees Celsius."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         if self.rest > self.rest_max:
-            raise ValueError(f"rest {self.rest} <= rest_max {self.rest_max} does not hold")
+            raise ValueError(f"expected rest {self.rest} <= rest_max {self.rest_max}")
         return self
 
 
@@ -71,19 +71,19 @@ class Ax12Config(Schema):
     speed: Annotated[float, Field(gt=0, le=1023 * SPEED_UNIT)] = 4.0
     """Maximum speed of a joint (rad/s)."""
     margin: Annotated[int, Field(ge=0, le=255)] = 1
-    """Steps from the goal within which a joint is content."""
+    """Distance from the goal at which a joint stops (steps)."""
     slope: Literal[2, 4, 8, 16, 32, 64, 128] = 32
     """Distance from the goal at which a joint applies full torque (steps)."""
     rate: Annotated[float, Field(gt=0, le=100)] = 25.0
-    """Times a second both joints are read; an adapter at its usual latency of 16 ms allows 31."""
+    """Rate at which both joints are read, Hz; an adapter with its usual latency of 16 ms allows 31."""
     check_interval: Positive = 1.0
     """Seconds between two checks of a joint's torque settings."""
     absent_interval: Annotated[float, Field(ge=1)] = 1.0
-    """Seconds between two questions to a joint that does not answer: each costs a whole time-out."""
+    """Seconds between two requests to a joint that does not answer: each costs a whole timeout."""
     return_delay: Annotated[float, Field(ge=0, le=508e-6)] = 500e-6
-    """Seconds a unit waits before it answers: its own setting."""
+    """Delay of a unit before its answer, s: a setting of the unit."""
     usb_latency: Annotated[float, Field(ge=0, le=0.255)] = 0.016
-    """Latency timer of the adapter, s; 0.001 only where that is confirmed."""
+    """Latency timer of the adapter, s; 0.001 only if confirmed."""
     command_timeout: Annotated[float, Field(gt=0, le=5)] = 0.5
     """Age of stale joint goals (s): they are ignored and the joints hold."""
     alarm: AlarmConfig = AlarmConfig()
@@ -101,6 +101,6 @@ class Ax12Config(Schema):
 
     def timeout(self, size: int, baud: int = AX12_BAUD) -> float:
         """Timeout of an exchange of ``size`` bytes (s): line, return delay, and the adapter in both directions."""
-        timeout_min = 0.005  # seconds; below that a busy host misses answers that came in time
-        scheduling = 0.002  # seconds a host may take in addition to line and adapter
+        timeout_min = 0.005  # seconds; below this a busy host misses timely answers
+        scheduling = 0.002  # additional delay by the host (s)
         return max(timeout_min, size * 10 / baud + self.return_delay + 2 * self.usb_latency + scheduling)

@@ -19,25 +19,25 @@ from monstertruck_schemas.sensor import StabiliserFeedback, StabiliserJoint, Tor
 STORED: Final = 19
 """Bytes of settings from the start of the control table."""
 ANSWERS_ALL: Final = b"\x02"
-"""Status level at which units also answer writes."""
+"""Status return level at which units also answer writes."""
 
 
 class Joint:
-    """Keeps one unit holding its goal; time passes only in ``join`` and ``poll``.
+    """Keeps one unit at its goal; it waits only in ``join`` and ``poll``.
 
-    **Alarms.** An overload or overheated unit sets its own torque limit to 0 and goes limp; it answers as before, and
-    its error bits may clear although it stays limp. So the driver reads the torque settings when the bits change
-    and from time to time. After a rest, once cool, the unit gets torque again; its goal is first set to its current
-    position, or it would jump.
+    **Alarms.** An overloaded or overheated unit sets its torque limit to 0 and goes limp. It still answers, and its
+    error bits may clear although it stays limp. So the driver reads the torque settings when the bits change and at
+    intervals. After a waiting time, once the unit is cool, the driver switches its torque on; it first sets the goal to
+    the current position, so that the unit does not jump.
 
-    **Motion without a goal.** A load pushes a joint away from its goal against the unit's torque. A unit whose
-    torque points away from its goal, and which moves that way, does not obey: the driver removes its torque.
+    **Motion without a goal.** A load pushes a joint away from its goal against the unit's torque. A unit that moves
+    away from its goal in the direction of its own torque does not obey: the driver removes its torque.
 
     Args:
         name: ``pitch`` or ``roll``.
         joint: calibration.
         config: times and limits.
-        clock: time.
+        clock: source of time.
         events: alarms, losses and returns.
         source: service name.
     """
@@ -56,11 +56,11 @@ class Joint:
         self._rest = config.alarm.rest
         self._held_at: int | None = None
         self._strays = 0
-        """Times that the unit drove itself away from its goal."""
+        """Number of times the unit drove itself away from its goal."""
         self.forget()
 
     def forget(self) -> None:
-        """Forget the unit's state at the start of a session; its rest after alarms continues."""
+        """Reset the unit's state at the start of a session; a waiting time after an alarm continues."""
         self.torque = TorqueState.ABSENT
         self._present: Present | None = None
         self._error = Alarm(0)
@@ -75,7 +75,7 @@ class Joint:
         self._goal: int | None = None
         """Latest goal sent (steps)."""
         self._straying = 0
-        """Number of latest readings in which the unit drove itself away from its goal."""
+        """Number of consecutive readings in which the unit drove itself away from its goal."""
 
     # Known state
 
@@ -85,12 +85,12 @@ class Joint:
         return None if self._present is None else self._joint.angle(self._present.position)
 
     def goal(self, angle: float) -> bytes:
-        """Bytes of the goal register for a joint angle, rad, held within the limits; it becomes the goal."""
+        """Set the goal for a joint angle (rad), within the limits; return the bytes of the goal register."""
         self._goal = self._joint.position(angle)
         return p.GOAL_POSITION.encode(self._goal)
 
     def feedback(self) -> StabiliserJoint:
-        """For the message; signs of the joint angle."""
+        """Feedback for the message, in the signs of the joint angle."""
         present = self._present
         if present is None:
             return StabiliserJoint(torque=self.torque, strays=self._strays)
@@ -108,14 +108,14 @@ class Joint:
     # Exchanges
 
     async def join(self, session: Ax12Session, retries: int = RETRIES) -> None:
-        """Check that the unit is present and matches the configuration; the next ``poll`` makes it hold.
+        """Check that the unit is present and matches the configuration; the next ``poll`` makes it hold its position.
 
         Raises:
             DeviceLostError: unplugged.
             DeviceTimeoutError: it does not answer.
-            ProtocolError: it refuses.
-            WrongDeviceError: no AX-12A.
-            DeviceMismatchError: it turns endlessly, or its limits forbid configured goals.
+            ProtocolError: the unit refuses.
+            WrongDeviceError: not an AX-12A.
+            DeviceMismatchError: it is in endless-turn mode, or its limits exclude configured goals.
         """
         self._ask_at = self._clock.now() + round(self._config.absent_interval * SECOND)
         await session.ping(self.id, retries)
@@ -137,8 +137,8 @@ class Joint:
 
         Raises:
             DeviceLostError: unplugged.
-            WrongDeviceError: the unit came back as a different unit.
-            DeviceMismatchError: the same, in its settings.
+            WrongDeviceError: the unit was replaced by another kind.
+            DeviceMismatchError: its settings do not match.
         """
         try:
             if self.torque is TorqueState.ABSENT:
@@ -163,11 +163,11 @@ class Joint:
         gap, gap_before = present.position - self._goal, before.position - self._goal
         driven = present.load * gap > 0 and abs(gap) > max(abs(gap_before), self._config.margin)
         self._straying = self._straying + 1 if driven else 0
-        strays = 3  # readings of a unit that drives itself away from its goal, after which it loses its torque
+        strays = 3  # number of such readings after which the unit loses its torque
         return self._straying >= strays
 
     async def _stop_straying(self, session: Ax12Session, present: Present) -> None:
-        """Remove the unit's torque for a rest; read it back, as a late answer may belong to an earlier write.
+        """Switch the torque off for a waiting time; read it back, because a late answer may belong to an earlier write.
 
         Raises:
             DeviceTimeoutError, ProtocolError: the unit does not confirm torque off; the next reading repeats it.
@@ -178,7 +178,7 @@ class Joint:
             raise ProtocolError(f"unit {self.id} ({self._name}) keeps its torque")
         self._straying, rest = 0, self._begin_rest()
         self._strays += 1
-        text = f"turned to {present.position} by itself, its goal is {self._goal}: no torque for {rest:g} s"
+        text = f"moved to {present.position} by itself, its goal is {self._goal}: torque off for {rest:g} s"
         self._report(Reason.UNCOMMANDED_MOTION, Severity.ERROR, text, position=present.position, goal=self._goal)
 
     async def _look_after(self, session: Ax12Session, present: Present, error: Alarm) -> None:
@@ -196,11 +196,11 @@ class Joint:
         if not limit:
             self._go_limp()
         elif not enabled or speed != self._config.speed_word:
-            self._report(Reason.DEVICE_FAULT, Severity.WARNING, "lost its settings, as by a brown-out: sent again")
+            self._report(Reason.DEVICE_FAULT, Severity.WARNING, "lost its settings, as after a brown-out: sent again")
             await self._hold(session, present)
 
     async def _hold(self, session: Ax12Session, present: Present) -> None:
-        """Give torque without a jump: the goal is where the joint is, or the limit next to it."""
+        """Switch the torque on without a jump: set the goal to the current position, or the nearest limit."""
         config, joint = self._config, self._joint
         goal = min(max(present.position, joint.min_position), joint.max_position)
         words = (p.GOAL_POSITION, goal), (p.MOVING_SPEED, config.speed_word), (p.TORQUE_LIMIT, self._max_torque)
@@ -215,17 +215,17 @@ class Joint:
         self._held_at = self._clock.now()
         if self._outage:
             self._outage = False
-            self._report(Reason.DEVICE_READY, Severity.INFO, "holds again")
+            self._report(Reason.DEVICE_READY, Severity.INFO, "torque on again")
 
     def _go_limp(self) -> None:
-        """The unit took its torque away itself: rest."""
+        """Start a waiting time after the unit removed its own torque."""
         reported, rest = self._outage, self._begin_rest()
         if not reported:
-            text = f"limp after {alarm_names(self._error)}: rests {rest:g} s"
+            text = f"torque lost after {alarm_names(self._error)}: waits {rest:g} s"
             self._report(Reason.DEVICE_FAULT, Severity.ERROR, text, error=int(self._error))
 
     def _begin_rest(self) -> float:
-        """Begin a rest and return its length (s); it doubles with each rest that follows too soon."""
+        """Start a waiting time and return its length (s); it doubles if it follows too soon."""
         alarm, now = self._config.alarm, self._clock.now()
         if self._held_at is not None and now - self._held_at >= alarm.settled_after * SECOND:
             self._rest = alarm.rest
@@ -248,7 +248,9 @@ class Joint:
     def report_absent(self, why: str) -> None:
         """Report that the unit does not answer."""
         self._outage = True
-        self._report(Reason.DEVICE_TIMEOUT, Severity.WARNING, f"does not answer, asked again once in a while: {why}")
+        self._report(
+            Reason.DEVICE_TIMEOUT, Severity.WARNING, f"does not answer, will be asked again at intervals: {why}"
+        )
 
     async def _settings(self, session: Ax12Session, retries: int = 0) -> tuple[int, int, int]:
         """Torque switch, moving speed, torque limit."""
@@ -259,10 +261,13 @@ class Joint:
         return data[0], word(data, 8), word(data, 10)
 
     async def _answer_all(self, session: Ax12Session) -> None:
-        """Store the status level that answers everything; whether this write is answered depends on the old one."""
+        """Set the status return level to answer every packet.
+
+        Whether this write is answered depends on the old level.
+        """
         with contextlib.suppress(DeviceTimeoutError):
             await session.write(self.id, p.STATUS_LEVEL, ANSWERS_ALL, retries=0)
-        self._report(Reason.DEVICE_MISMATCH, Severity.INFO, "did not answer everything: status level set to 2")
+        self._report(Reason.DEVICE_MISMATCH, Severity.INFO, "did not answer every packet: status return level set to 2")
 
     def _check(self, stored: bytes) -> None:
         model = word(stored, p.MODEL_NUMBER.address)
@@ -272,14 +277,14 @@ class Joint:
         wanted = (self._joint.min_position, self._joint.max_position)
         if low > wanted[0] or high < wanted[1]:
             raise DeviceMismatchError(
-                f"unit {self.id} ({self._name}): its angle limits are {low}..{high} (0..0 turns endlessly), "
+                f"unit {self.id} ({self._name}): its angle limits are {low}..{high} (0..0: endless turn), "
                 f"expected to allow {wanted[0]}..{wanted[1]}"
             )
 
     # Reports
 
     def _report_alarms(self, error: Alarm, now: int) -> None:
-        """Each bit once, until all were clear for a while."""
+        """Report each error bit once, until all have been clear for a while."""
         if not error:
             if self._reported and now - self._clean_since >= self._config.alarm.settled_after * SECOND:
                 self._reported = Alarm(0)
@@ -297,11 +302,11 @@ class Joint:
 class Ax12Driver:
     """Forwards joint goals as they arrive, in one sync write for both units, and reads both in between.
 
-    The units have no watchdog: they hold their last goal when goals stop or the session ends. If one unit does
-    not answer, the other keeps working; if none answers, the session is lost (12 V rail or bus).
+    The units have no watchdog: they hold their last goal when goals stop or the session ends. If one unit does not
+    answer, the other continues; if none answers, the session is lost (12 V rail or bus).
 
     Args:
-        config: calibration, rates, time-outs, alarms.
+        config: calibration, rates, timeouts, alarms.
         port: the adapter's port, at 1 Mbaud.
         clock: time, also the clock of the goals' stamps.
         commands: joint goals.
@@ -357,13 +362,15 @@ class Ax12Driver:
                 missing[joint] = str(error)
         if len(missing) == len(self._joints):
             ids = " and ".join(str(joint.id) for joint in self._joints)
-            if session.strange >= 3:  # bytes out of form that show another device; fewer may be disturbances
+            if session.strange >= 3:  # number of invalid bytes that indicates another device; fewer may be disturbances
                 raise WrongDeviceError(
-                    f"{self._port.name}: {session.strange} bytes, but no answer of an AX-12A: another device, another "
-                    f"baud rate than {session.baud}, or several units with one id; expected ids {ids}"
+                    f"{self._port.name}: {session.strange} bytes, but no answer of an AX-12A: another "
+                    f"device, another baud rate than {session.baud}, or several units with one id; "
+                    f"expected ids {ids}"
                 )
             raise DeviceTimeoutError(
-                f"{self._port.name}: silence; expected AX-12A units {ids}: is the 12 V rail up, the adapter at TTL?"
+                f"{self._port.name}: silent; expected AX-12A units {ids}: check the 12 V rail, and that "
+                "the adapter is set to TTL"
             )
         for joint, why in missing.items():
             joint.report_absent(why)
@@ -376,11 +383,11 @@ class Ax12Driver:
             for joint in self._joints:
                 await joint.poll(session)
             if all(joint.torque is TorqueState.ABSENT for joint in self._joints):
-                raise DeviceTimeoutError(f"{self._port.name}: no unit answers any more: is the 12 V rail down?")
+                raise DeviceTimeoutError(f"{self._port.name}: no unit answers any more: check the 12 V rail")
             self._publish(asked)
 
     async def _follow(self, session: Ax12Session, until: int) -> None:
-        """Pass goals on as they come."""
+        """Forward goals as they arrive."""
         while (command := await self._commands.next_within((until - self._clock.now()) / SECOND)) is not None:
             if self._clock.now() - command.stamp <= self._config.command_timeout * SECOND:
                 await self._aim(session, command)

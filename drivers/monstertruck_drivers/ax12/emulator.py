@@ -118,7 +118,7 @@ class Ax12Bus(FaultyDevice):
         self._volts: float | None = None
         self._rng = np.random.default_rng(seed)
         self._late_s, self._late = 0.0, 0
-        """Time that answers come later (s), and the number of them."""
+        """Additional delay of answers (s), and the number of delayed answers."""
         places = positions or {}
         now = clock.now()
         kinds: dict[str, SignalKind] = {}
@@ -177,7 +177,7 @@ class Ax12Bus(FaultyDevice):
         for unit in self.units:
             if unit.get(p.ID) == ident:
                 return unit
-        raise InputError(f"{self.name}: no unit {ident}; there are {[unit.get(p.ID) for unit in self.units]}")
+        raise InputError(f"{self.name}: no unit {ident}; expected one of {[unit.get(p.ID) for unit in self.units]}")
 
     def _power(self, *, on: bool) -> None:
         now = self._clock.now()
@@ -190,7 +190,7 @@ class Ax12Bus(FaultyDevice):
     # Serving
 
     async def run(self, end: DeviceEnd) -> None:
-        """Serve the host that has the port open."""
+        """Serve the connected host."""
         parser, heard = Ax12Parser(), 0
         while True:
             data = await end.read()
@@ -229,7 +229,7 @@ class Ax12Bus(FaultyDevice):
             self._answer(end, answers, units)
 
     def _execute(self, unit: Unit, packet: Packet) -> Packet | None:
-        """Carry out a request; the answer, if the unit's status level has one."""
+        """Execute a request; return the answer if the unit's status return level includes one."""
         now, params = self._clock.now(), packet.params
         ident, answers_from = unit.get(p.ID), unit.get(p.STATUS_LEVEL)
         level, error, data = 2, Alarm(0), b""
@@ -288,18 +288,18 @@ class Ax12Bus(FaultyDevice):
 
 
 def really(joint: JointConfig, horn: Horn) -> tuple[float, int]:
-    """Zero (steps) and direction of a joint as it was put together."""
+    """Zero (steps) and direction of a joint as assembled."""
     zero = joint.zero if horn.zero is None else horn.zero
     return float(zero), joint.direction if horn.direction is None else horn.direction
 
 
 class TrueJoints:
-    """``JointSource``: where the shafts of an emulated stabiliser really are.
+    """``JointSource`` with the true shaft positions of an emulated stabiliser.
 
     Args:
-        bus: the units.
-        config: which unit turns what.
-        horns: how both were put together.
+        bus: bus of the units.
+        config: assignment of units to joints.
+        horns: assembly of both servos.
     """
 
     def __init__(self, bus: Ax12Bus, config: Ax12Config, horns: tuple[Horn, Horn] = (AS_SET, AS_SET)) -> None:
@@ -317,7 +317,10 @@ class TrueJoints:
 
 
 def emulated(setup: EmulatorSetup) -> Ax12Bus:
-    """Both units below a simulated truck's lidar, at rest where it is parallel to the body; a line of real speed."""
+    """Create both units below a simulated truck's lidar, at rest with the lidar parallel to the body.
+
+    A line of realistic speed.
+    """
     config: Ax12Config = setup.settings or Ax12Config()
     joints, horns = (config.pitch, config.roll), setup.physics.horns()
     real = {joint.id: really(joint, horn) for joint, horn in zip(joints, horns, strict=True)}

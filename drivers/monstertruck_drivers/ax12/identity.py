@@ -1,4 +1,4 @@
-"""Find the units on the bus and read them, without motion."""
+"""Find and read the units on the bus, without motion."""
 
 from monstertruck_drivers.ax12 import protocol as p
 from monstertruck_drivers.ax12.config import Ax12Config
@@ -20,7 +20,7 @@ async def identify(link: Link, clock: Clock, settings: Ax12Config) -> dict[str, 
         status level, error names, position in steps, voltage, temperature and torque settings.
 
     Raises:
-        DeviceTimeoutError: silence; the text says what to check.
+        DeviceTimeoutError: silence; the text names what to check.
         WrongDeviceError: bytes, but no unit.
     """
     session = Ax12Session(link, clock, settings.timeout)
@@ -30,7 +30,7 @@ async def identify(link: Link, clock: Clock, settings: Ax12Config) -> dict[str, 
         raise WrongDeviceError(f"{link.name}: {session.strange} bytes, but no answer of an AX-12A")
     if not units:
         raise DeviceTimeoutError(
-            f"{link.name}: silence; expected AX-12A units: is the 12 V rail up, the adapter at TTL?"
+            f"{link.name}: silent; expected AX-12A units: check the 12 V rail, and that the adapter is set to TTL"
         )
     return {"echo": session.echo, "units": units}
 

@@ -1,6 +1,6 @@
 """Bytes of the Dynamixel protocol 1.0 and the control table of the AX-12A.
 
-Source: maker's e-manual, "DYNAMIXEL Protocol 1.0" and "AX-12A" (control table, units, error bits).
+Source: manufacturer's e-manual, "DYNAMIXEL Protocol 1.0" and "AX-12A" (control table, units, error bits).
 """
 
 import math
@@ -11,10 +11,10 @@ from typing import Final, Self
 
 HEADER: Final = b"\xff\xff"
 BROADCAST: Final = 254
-"""Unit number that all units execute and none answers."""
+"""Broadcast id: all units execute the instruction, none answers."""
 ID_MAX: Final = 253
 LONGEST_PACKET: Final = 150
-"""Maximum length byte a parser waits for; higher values are treated as damage."""
+"""Maximum length byte that a parser accepts; higher values are treated as damage."""
 AX12_BAUD: Final = 1_000_000
 MODEL: Final = 12
 """Model number of an AX-12A."""
@@ -23,14 +23,14 @@ WORD_SIGN: Final = 1 << 10
 """Bit of speed and load words that means clockwise."""
 
 STEP: Final = math.radians(300 / POSITION_MAX)
-"""Radians in one step of a position."""
+"""Radians per position step."""
 SPEED_UNIT: Final = 0.111 * math.tau / 60
-"""Rad/s in one unit of a speed."""
+"""Speed unit, rad/s."""
 LOAD_UNIT: Final = 0.001
-"""Share of the greatest torque in one unit of a load."""
+"""Load unit, as a fraction of the maximum torque."""
 VOLT_UNIT: Final = 0.1
 DELAY_UNIT: Final = 2e-6
-"""Seconds in one unit of the return delay."""
+"""Unit of the return delay, s."""
 
 
 class Instruction(IntEnum):
@@ -47,7 +47,7 @@ class Instruction(IntEnum):
 
 
 class Alarm(IntFlag):
-    """Error bits of a status packet; several may be set, and its data counts all the same."""
+    """Error bits of a status packet; several may be set, and its data is valid all the same."""
 
     VOLTAGE = 1 << 0
     ANGLE = 1 << 1
@@ -59,7 +59,7 @@ class Alarm(IntFlag):
 
 
 def alarm_names(bits: int) -> str:
-    """Names of the bits set, joined; an unknown bit as hexadecimal."""
+    """Names of the set bits, joined; an unknown bit as hexadecimal."""
     names = [(bit.name or "").lower() for bit in Alarm if bits & bit]
     unknown = bits & ~sum(Alarm)
     return "+".join([*names, hex(unknown)] if unknown else names) or "none"
@@ -67,7 +67,7 @@ def alarm_names(bits: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Register:
-    """One item of the control table."""
+    """One register of the control table."""
 
     address: int
     size: int = 1
@@ -78,7 +78,7 @@ class Register:
 
     @property
     def is_stored(self) -> bool:
-        """Kept without power (EEPROM)."""
+        """Whether it is stored in EEPROM."""
         return self.address < RAM_START
 
     def encode(self, value: int) -> bytes:
@@ -86,7 +86,7 @@ class Register:
         return value.to_bytes(self.size, "little")
 
     def decode(self, table: bytes | bytearray) -> int:
-        """Its value in a whole control table."""
+        """Value of this register in a whole control table."""
         return int.from_bytes(table[self.address : self.address + self.size], "little")
 
 
@@ -128,10 +128,10 @@ PUNCH: Final = Register(48, 2, 32, 1023)
 
 REGISTERS: Final = tuple(value for value in list(globals().values()) if isinstance(value, Register))
 RESERVED: Final = frozenset(range(TABLE_SIZE)) - {r.address + i for r in REGISTERS for i in range(r.size)}
-"""Addresses without meaning."""
+"""Reserved addresses."""
 
 PRESENT_SIZE: Final = 8
-"""Bytes from ``PRESENT_POSITION`` to the temperature: one read holds a unit's whole state."""
+"""Number of bytes from ``PRESENT_POSITION`` to the temperature: one read returns a unit's whole state."""
 
 
 def slope_of(value: int) -> int:
@@ -158,7 +158,10 @@ def word(data: bytes, at: int = 0) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Present:
-    """The eight bytes from ``PRESENT_POSITION`` on, in the unit's own units; counter-clockwise positive."""
+    """Unit state from the eight bytes starting at ``PRESENT_POSITION``, in the unit's own units.
+
+    Counter-clockwise positive.
+    """
 
     position: int
     speed: int
@@ -173,20 +176,20 @@ class Present:
 
 
 def checksum(body: bytes) -> int:
-    """Checksum over everything between header and sum."""
+    """Checksum over everything between header and checksum."""
     return ~sum(body) & 0xFF
 
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """A request (``code`` is an instruction) or a status (``code`` holds error bits)."""
+    """A request (``code`` is an instruction) or a status (``code`` contains error bits)."""
 
     unit: int
     code: int
     params: bytes = b""
 
     def encode(self) -> bytes:
-        """Wire form."""
+        """Encoded packet."""
         body = bytes((self.unit, len(self.params) + 2, self.code)) + self.params
         return HEADER + body + bytes((checksum(body),))
 
@@ -197,12 +200,12 @@ def ping(unit: int) -> bytes:
 
 
 def read(unit: int, start: Register, count: int) -> bytes:
-    """Ask for ``count`` bytes from ``start`` on."""
+    """Request ``count`` bytes starting at ``start``."""
     return Packet(unit, Instruction.READ, bytes((start.address, count))).encode()
 
 
 def write(unit: int, start: Register, data: bytes) -> bytes:
-    """Write ``data`` from ``start`` on."""
+    """Write ``data`` starting at ``start``."""
     return Packet(unit, Instruction.WRITE, bytes((start.address,)) + data).encode()
 
 
@@ -224,7 +227,7 @@ def sync_write(start: Register, data: Mapping[int, bytes]) -> bytes:
 
 
 class Ax12Parser:
-    """Extracts packets from bytes, however they are cut; buffers at most one packet.
+    """Extracts packets from a byte stream in any fragmentation; buffers at most one packet.
 
     The protocol has no byte stuffing: a header may occur inside parameters. The parser therefore takes packets by
     length and verifies their sum; after a failure it continues the search one byte further.
@@ -235,16 +238,16 @@ class Ax12Parser:
 
     def __init__(self, longest: int = LONGEST_PACKET) -> None:
         self.damaged: list[int] = []
-        """Units named in frames of the last ``feed`` whose sum was wrong."""
+        """Units in packets of the last ``feed`` with a wrong checksum."""
         self._longest = longest
         self._buffer = bytearray()
 
     def __len__(self) -> int:
-        """Bytes held back."""
+        """Buffered bytes."""
         return len(self._buffer)
 
     def feed(self, data: bytes) -> list[Packet]:
-        """Packets that became complete, in order."""
+        """Return the completed packets, in order."""
         self._buffer += data
         self.damaged = []
         packets: list[Packet] = []

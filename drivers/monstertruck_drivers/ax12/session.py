@@ -22,16 +22,16 @@ class Answer:
 
 
 class Ax12Session:
-    """One session; the host speaks first, always.
+    """One session; only the host initiates exchanges.
 
-    A passive adapter gives back every byte that is sent. An echoed request looks like a status packet, even like a
-    good one; so whether there is an echo is found out once, by a request no answer resembles, and from then on each
-    exchange drops it.
+    A passive adapter echoes every sent byte. An echoed request looks like a valid status packet. So the session
+    determines once whether there is an echo, by a request that no answer resembles, and then drops the echo in each
+    exchange.
 
     Args:
         link: open link to the adapter.
         clock: time.
-        timeout: seconds to wait for an exchange of so many bytes at a baud rate.
+        timeout: returns the timeout of an exchange of a number of bytes at a baud rate, s.
     """
 
     def __init__(self, link: Link, clock: Clock, timeout: Callable[[int, int], float]) -> None:
@@ -42,19 +42,21 @@ class Ax12Session:
         self._clock = clock
         self._timeout = timeout
         self.baud = link.baud or protocol.AX12_BAUD
-        """Bits per second of the line."""
+        """Baud rate of the line."""
         self._quiet_until = 0
         self._behind: dict[int, int] = {}
-        """Data bytes of an answer to a read that may still come, by unit: it would look like that to the next one."""
+        """Data length of the answer to a read that may still arrive, by unit: the next read could take it for its
+        own.
+        """
 
     async def find_echo(self, *units: int) -> None:
-        """Find out whether the adapter echoes; any of ``units`` may be absent.
+        """Determine whether the adapter echoes; any of ``units`` may be absent.
 
         Raises:
             DeviceLostError: unplugged.
         """
         for unit in units:
-            # An answer to this holds three bytes, its echo two.
+            # The answer contains three bytes, its echo two.
             request = protocol.read(unit, protocol.MODEL_NUMBER, 3)
             heard = await self._exchange(request, 3, lambda packet: len(packet.params) in (2, 3))
             if heard is not None:
@@ -62,7 +64,7 @@ class Ax12Session:
                 return
 
     async def ping(self, unit: int, retries: int = RETRIES) -> Alarm:
-        """Error bits of a unit that is there.
+        """Ping a unit; return its error bits.
 
         Raises:
             DeviceLostError: unplugged.
@@ -105,7 +107,7 @@ class Ax12Session:
         await self._clock.sleep_until(self._quiet_until)
         packet = protocol.sync_write(start, data)
         self._link.write(packet)
-        gap = 100e-6  # seconds between a packet without an answer and the next one
+        gap = 100e-6  # seconds between a packet without an answer and the next packet
         self._quiet_until = self._clock.now() + round((len(packet) * 10 / self.baud + gap) * SECOND)
 
     async def _ask(self, unit: int, request: bytes, count: int, retries: int) -> Answer:
@@ -130,7 +132,7 @@ class Ax12Session:
         raise DeviceTimeoutError(f"{self._link.name}: unit {unit}: no correct answer")
 
     async def _catch_up(self, unit: int) -> bool:
-        """Ping, whose answer has no data: answers arrive in order, so late answers arrive before it."""
+        """Send a ping, whose answer has no data: answers arrive in order, so late answers arrive before it."""
 
         def wanted(packet: Packet) -> bool:
             return packet.unit == unit and not packet.params
@@ -141,17 +143,17 @@ class Ax12Session:
         return True
 
     async def _exchange(self, request: bytes, count: int, wanted: Callable[[Packet], bool]) -> Packet | None:
-        """Send a request; the first wanted packet, or None when time is up.
+        """Send a request; return the first matching packet, or None on timeout.
 
         Args:
-            request: whole packet.
-            count: data bytes the answer should have.
+            request: encoded packet.
+            count: number of data bytes in the answer.
             wanted: distinguishes the answer from late ones to earlier requests.
         """
         await self._clock.sleep_until(self._quiet_until)
         self._link.discard()
         self._link.write(request)
-        # A damaged length must not make the parser wait for more than can come.
+        # A damaged length must not make the parser wait for more bytes than the answer has.
         parser = Ax12Parser(longest=max(len(request) - 4, count + 2))
         echo_due = self.echo
         end = self._clock.now() + round(self._timeout(len(request) + 6 + count, self.baud) * SECOND)

@@ -15,9 +15,9 @@ from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND
 
 Load = Callable[[int, int], float]
-"""Torque, N m, that pushes the shaft of a unit (first argument) at a time, ns; counter-clockwise positive."""
+"""Load torque (N m) on the shaft of a unit (first argument) at a time (ns); counter-clockwise positive."""
 Voltage = Callable[[int], float]
-"""Supply, V, at a time, ns."""
+"""Supply voltage at a time (ns), V."""
 
 REPORTED: Final = {
     "position": p.PRESENT_POSITION,
@@ -44,7 +44,7 @@ def unit_signals(number: int) -> dict[str, SignalKind]:
 TICK: Final = 2_000_000
 """Nanoseconds of one step of the motion."""
 OVERLOAD_TIME: Final = 1.0
-"""Seconds until the alarm."""
+"""Time of overload until the alarm, s."""
 AMBIENT: Final = 25.0
 NO_ALARM: Final = Alarm(0)
 
@@ -79,14 +79,14 @@ class Unit:
         self._number = number
         self.blocked = False
         self.frozen = False
-        """The position sensor repeats its last value."""
+        """Whether the position sensor repeats its last value."""
         self.stray: float | None = None
         """Position (steps) that the control loop turns to instead of the goal."""
         self.powered = True
         self.present = True
-        """False: fallen off the bus."""
+        """Whether the unit is on the bus."""
         self.latched = True
-        """Alarms stay in the error bits until torque is given again; otherwise only while their cause lasts."""
+        """Whether alarms stay in the error bits until torque is switched on; otherwise only while their cause lasts."""
         self.temperature = AMBIENT
         self.position = position
         self._load = load
@@ -98,7 +98,7 @@ class Unit:
         self._alarms = NO_ALARM
         self._sensed = position
         self._pending: tuple[int, bytes] | None = None
-        history = 1024  # points of the shaft's past that are kept: two seconds of motion
+        history = 1024  # number of past shaft positions that are kept: two seconds of motion
         self._past: deque[tuple[int, float]] = deque([(time_ns, position)], maxlen=history)
         self._table = bytearray(p.TABLE_SIZE)
         self._values: dict[int, int] = {}
@@ -118,7 +118,7 @@ class Unit:
         self._values[register.address] = value
 
     def read(self, address: int, count: int, time_ns: int) -> tuple[Alarm, bytes]:
-        """Bytes of the table; error bits of the request alone."""
+        """Bytes of the table; only error bits of the request."""
         if not count or address + count > p.TABLE_SIZE:
             return Alarm.RANGE, b""
         self.advance(time_ns)
@@ -126,7 +126,7 @@ class Unit:
         return NO_ALARM, bytes(self._table[address : address + count])
 
     def write(self, address: int, data: bytes, time_ns: int) -> Alarm:
-        """All of it or, with an error bit, nothing."""
+        """Write all of it or, with an error bit, nothing."""
         error = self._refusal(address, data)
         if error:
             return error
@@ -158,7 +158,7 @@ class Unit:
         return error
 
     def act(self, time_ns: int) -> Alarm:
-        """Carry out the registered write."""
+        """Execute the registered write."""
         if self._pending is None:
             return Alarm.INSTRUCTION
         (address, data), self._pending = self._pending, None
@@ -166,7 +166,7 @@ class Unit:
         return self.write(address, data, time_ns)
 
     def factory_reset(self) -> None:
-        """Everything to its default: number 1 among them."""
+        """Set every register to its default, including the id 1."""
         for register in p.REGISTERS:
             self.put(register, register.default)
         self._boot()
@@ -207,11 +207,11 @@ class Unit:
 
     @property
     def wheel_mode(self) -> bool:
-        """Turns endlessly: both limits are 0."""
+        """Whether it is in endless-turn mode: both limits are 0."""
         return not self.get(p.CW_LIMIT) and not self.get(p.CCW_LIMIT)
 
     def _refresh(self) -> None:
-        """Measurements into the table."""
+        """Update the measurements in the table."""
         if not self.frozen:
             self._sensed = self.position
         measured = {
@@ -230,12 +230,12 @@ class Unit:
                 self.put(register, min(max(value, 0), register.high))
 
     def error(self, time_ns: int) -> Alarm:
-        """Error bits of the unit's state."""
+        """Error bits from the unit's state."""
         self.advance(time_ns)
         return self._alarms
 
     def trip(self, alarm: Alarm) -> None:
-        """An alarm fires now."""
+        """Trigger an alarm now."""
         self._alarms |= alarm
         if alarm & self.get(p.SHUTDOWN):
             self.put(p.TORQUE_LIMIT, 0)
@@ -243,7 +243,7 @@ class Unit:
     # Supply
 
     def power(self, on: bool, time_ns: int) -> None:
-        """Switch the supply; the table's first part and the shaft's place survive."""
+        """Switch the supply; the EEPROM and the shaft's position survive."""
         self.advance(time_ns)
         self.powered = on
         if on:
@@ -255,7 +255,7 @@ class Unit:
     # Motion
 
     def angles(self, times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Shaft in steps at instants of the last seconds (or, beyond, the nearest known)."""
+        """Shaft position at times within the last seconds, or the nearest known one (steps)."""
         self.advance(int(times_ns.max()))
         if times_ns.min() >= self._time:
             return np.full(times_ns.shape, self.position)
@@ -306,7 +306,7 @@ class Unit:
         volts = self._volts() / rated_voltage
         if self.blocked or volts <= 0:
             return 0.0
-        gear_friction = 0.15  # N m the unpowered gear holds
+        gear_friction = 0.15  # N m that the unpowered gear holds
         if self._drive == 0 and abs(push) <= gear_friction:
             return 0.0
         no_load_speed = 59 * tau / 60 / p.STEP  # steps a second at rated voltage and full drive
@@ -327,7 +327,7 @@ class Unit:
             before = self.position
             self.position = min(max(before + (left if overshoots else move), 0.0), float(p.POSITION_MAX))
             self._speed = (self.position - before) / seconds
-        heat_rise = 80.0  # degrees above the surroundings that lasting full drive ends at
+        heat_rise = 80.0  # final temperature above ambient at full drive, degrees
         target = AMBIENT + heat_rise * self._drive**2
         heat_time = 100.0  # time constant of the temperature, s
         self.temperature += (target - self.temperature) * (1 - exp(-seconds / heat_time))
@@ -335,7 +335,7 @@ class Unit:
     def _judge(self, seconds: float) -> None:
         if not self.powered:
             return
-        overload_drive = 0.8  # share of the full torque that, without motion, is an overload
+        overload_drive = 0.8  # fraction of the full torque that counts as overload without motion
         stalled = abs(self._drive) >= min(overload_drive, self.get(p.TORQUE_LIMIT) / 1023) and abs(self._speed) < 1
         self._overload_for = self._overload_for + seconds if stalled and self._drive else 0.0
         volts = self._volts() / p.VOLT_UNIT

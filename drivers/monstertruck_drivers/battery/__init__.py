@@ -1,1 +1,1 @@
-"""The truck's battery: judgement shared by everything that measures it, and a source on Linux IIO converters."""
+"""The truck's battery: monitoring shared by all measuring devices, and a source on Linux IIO converters."""

@@ -24,18 +24,19 @@ class PackConfig(Schema):
     capacity_ah: Annotated[float, Field(gt=0, le=100)] = 5.0
     """Capacity of the pack in the truck, Ah: 3.7, 4.0 or 5.0"""
     resistance: Annotated[float, Field(ge=0, le=1)] = 0.06
-    """Ohm of cells and wiring, for the sag; 5 to 15 milliohm per cell are usual. Fit it from a start of the motor: with
-    half the true value the charge reads up to 0.2 too low at 100 W"""
+    """Resistance of cells and wiring for the sag, ohm; 5 to 15 milliohm per cell are usual. Fit it from a start of the
+    motor: with half the true value the charge reads up to 0.2 too low at 100 W
+    """
     max_compensation: Volts = 1.5
     """Maximum sag attributed to the motor's current, so that a wrong current cannot hide an empty pack"""
     smoothing: Seconds = 5.0
-    """Time constant of the published voltages."""
+    """Time constant of the published voltages, s."""
     low: Volts = 22.0
     """Voltage below which the pack is low."""
     low_after: Seconds = 10.0
     """Time below ``low`` before it is reported (s)."""
     clear: Volts = 22.4
-    """Low and critical end above this."""
+    """Voltage above which low and critical end."""
     clear_after: Seconds = 30.0
     """Time above ``clear`` before low and critical end (s)."""
     critical: Volts = 21.0
@@ -43,7 +44,7 @@ class PackConfig(Schema):
     critical_after: Seconds = 10.0
     """Time below ``critical`` before it is reported (s)."""
     collapsed: Volts = 19.8
-    """Critical too, after a shorter time."""
+    """Voltage that is critical after a shorter time."""
     collapsed_after: Seconds = 2.0
     """Time below ``collapsed`` before it is reported (s)."""
     overcharged: Volts = 25.3
@@ -51,9 +52,9 @@ class PackConfig(Schema):
     overcharged_after: Seconds = 2.0
     """Time above ``overcharged`` before it is reported (s)."""
     overcharged_clear: Volts = 25.2
-    """Overcharged ends below this."""
+    """Voltage below which overcharged ends."""
     plausible_min: Volts = 15.0
-    """Outside the plausible range the sensor is at fault, not the battery."""
+    """Bounds of the plausible range, outside of which the sensor, not the battery, is considered faulty."""
     plausible_max: Volts = 26.0
     """Upper end of the plausible range."""
 
@@ -71,7 +72,7 @@ class PackConfig(Schema):
         )
         for lower, upper in pairwise(order):
             if not getattr(self, lower) < getattr(self, upper):
-                raise ValueError(f"{lower} {getattr(self, lower)} < {upper} {getattr(self, upper)} does not hold")
+                raise ValueError(f"expected {lower} {getattr(self, lower)} < {upper} {getattr(self, upper)}")
         return self
 
 
@@ -80,14 +81,14 @@ class IioConfig(PackConfig):
 
     kind: Literal["iio"] = "iio"
     device: str = ""
-    """Name the converter gives itself (file ``name``), such as ads1015; empty = the only one there is"""
+    """Name of the converter (file ``name``), such as ads1015; empty: the only one"""
     channel: Annotated[int, Field(ge=0, le=63)] = 0
-    """Number N of in_voltageN_raw"""
+    """Channel number N of in_voltageN_raw"""
     divider: Annotated[float, Field(gt=0)] = 10.0
     """Pack volts per volt at the pin; calibrate with a multimeter"""
     offset: float = 0.0
-    """Volts added to the pack's voltage"""
+    """Offset added to the pack voltage, V"""
     full_scale: Annotated[int, Field(gt=0)] | None = None
-    """Maximum reading of the converter; None = from its scan element, or unknown"""
+    """Maximum reading of the converter; None: from its scan element, or unknown"""
     rate: Annotated[float, Field(gt=0, le=50)] = 10.0
-    """Readings a second"""
+    """Readings per second"""

@@ -22,7 +22,7 @@ class IioBatteryDriver:
         clock: time.
         out: battery messages.
         events: changes of the battery's level.
-        drive: motor feedback, whose current explains the sag; None = unused.
+        drive: motor feedback, whose current explains the sag; None: not used.
         name: service name.
     """
 
@@ -47,10 +47,10 @@ class IioBatteryDriver:
         """Serve one session.
 
         Raises:
-            DeviceLostError: no such converter, or it vanished.
+            DeviceLostError: the converter is missing or has disappeared.
             DeviceMismatchError: the converter lacks the channel, or there are several and none is configured.
             DeviceTimeoutError: it does not answer, three readings in a row.
-            ProtocolError: no numbers, three readings in a row.
+            ProtocolError: the converter returned no number, three readings in a row.
             PortBusyError: another process streams from it.
         """
         channel = await self._offload(self._find)
@@ -77,7 +77,8 @@ async def identify(computer: Computer, clock: Clock, settings: IioConfig) -> dic
     """Read every voltage input of every converter once.
 
     Returns:
-        JSON-able: ``converters``: name, path, and per channel the reading and the volts at the pin, or why not.
+        JSON-compatible: ``converters`` with name, path, and for each channel the reading and the pin voltage, or the
+        error.
     """
     root = computer.root / iio.CONVERTERS
     return await computer.machine.offload(

@@ -1,4 +1,4 @@
-"""The sysfs files of a converter with the battery's divider on one channel."""
+"""Sysfs files of a converter with the battery's divider on one channel."""
 
 from collections.abc import Callable
 from functools import partial
@@ -20,19 +20,19 @@ COUNTS: Final = "counts"
 
 
 class IioEmulator(FaultyDevice):
-    """A 12-bit converter, 1 mV a count, as the kernel shows it.
+    """A 12-bit converter, 1 mV per count, as the kernel presents it.
 
     Faults (``inject``): ``zero on|off`` (upper resistor open), ``full on|off`` (lower resistor open), ``freeze
     on|off``, ``garbage on|off``, ``bounce [SECONDS]`` (0 for 50 ms), ``noise LSB``, ``volts V`` (at the pin,
     instead of the source), ``unplug``, ``plug``.
 
     Args:
-        root: folder that stands for /.
+        root: folder that replaces /.
         clock: time.
-        source: volts at the pin at an instant, ns.
+        source: pin voltage at a time (ns), V.
         seed: seed of the noise.
-        channel: input the divider hangs on.
-        device: the converter's name.
+        channel: channel of the divider.
+        device: name of the converter.
     """
 
     FULL_SCALE: Final = 4095
@@ -49,7 +49,7 @@ class IioEmulator(FaultyDevice):
     ) -> None:
         self.name = "battery"
         self.plugged = False
-        """Whether the kernel shows it."""
+        """Whether the kernel presents it."""
         self._files = FileTree(root / CONVERTERS)
         self._clock = clock
         self._source = source
@@ -76,7 +76,7 @@ class IioEmulator(FaultyDevice):
         self.plug()
 
     def plug(self) -> None:
-        """The kernel found the converter."""
+        """Create the files, as when the kernel finds the converter."""
         self.plugged = True
         self._files.put(f"{FOLDER}/name", self._device)
         self._files.put(f"{FOLDER}/in_voltage_scale", "1.000000000")
@@ -84,7 +84,7 @@ class IioEmulator(FaultyDevice):
         self.convert()
 
     def unplug(self) -> None:
-        """The converter is gone."""
+        """Remove the files."""
         self.plugged = False
         self._files.remove(FOLDER)
 
@@ -96,7 +96,7 @@ class IioEmulator(FaultyDevice):
             await self._clock.sleep(0.05)  # seconds between two conversions
 
     def convert(self) -> None:
-        """One conversion becomes readable, at once and whole."""
+        """Publish one conversion atomically."""
         now = self._clock.now()
         text = self._forced
         if now < self._bounce_until:
@@ -120,7 +120,7 @@ class IioEmulator(FaultyDevice):
 
 
 def emulated(setup: EmulatorSetup) -> IioEmulator:
-    """The converter at the battery of a simulated truck."""
+    """Create the converter at the battery of a simulated truck."""
     config: IioConfig = setup.settings or IioConfig()
     device = config.device or "mcp3208"
     return IioEmulator(

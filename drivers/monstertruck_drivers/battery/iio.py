@@ -1,4 +1,4 @@
-"""Voltages of Linux Industrial-IO converters, read from sysfs; every function blocks and belongs into a thread.
+"""Voltages of Linux Industrial-IO converters, read from sysfs; every function blocks and must run in a thread.
 
 Source: kernel documentation, ABI/testing/sysfs-bus-iio: a voltage in millivolts is (raw + offset) * scale, where
 offset and scale may be given per channel or for all.
@@ -42,36 +42,36 @@ class Converter:
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """One voltage input, ready to be read."""
+    """One voltage input, prepared for reading."""
 
     file: Path
     scale: float
     """Millivolts per count."""
     offset: float
-    """Counts."""
+    """Offset, counts."""
     full_scale: int | None
-    """Maximum reading; None = unknown."""
+    """Maximum reading, counts; None: unknown."""
 
     def read(self) -> int:
-        """Counts.
+        """Raw reading, counts.
 
         Raises:
             DeviceError: see ``read_text``.
-            ProtocolError: not a number.
+            ProtocolError: the file contains no number.
         """
         return int(_number(self.file))
 
     def volts(self, raw: int) -> float:
-        """Voltage at the pin."""
+        """Voltage at the pin, V."""
         return (raw + self.offset) * self.scale / 1000
 
     def at_limit(self, raw: int) -> bool:
-        """Whether the reading is an end of the scale."""
+        """Whether the reading is at an end of the scale."""
         return raw <= 0 or (self.full_scale is not None and raw >= self.full_scale)
 
 
 def converters(root: Path = ROOT) -> list[Converter]:
-    """All converters the kernel knows."""
+    """All converters known to the kernel."""
     found = []
     for path in sorted(root.glob("iio:device*")):
         try:
@@ -82,11 +82,11 @@ def converters(root: Path = ROOT) -> list[Converter]:
 
 
 def find(root: Path, name: str) -> Converter:
-    """The converter of that name, or the only one if ``name`` is empty.
+    """Find the converter of that name, or the only one if ``name`` is empty.
 
     Raises:
-        DeviceLostError: there is none.
-        DeviceMismatchError: several, and no name to choose by.
+        DeviceLostError: no converter found.
+        DeviceMismatchError: several converters, and no name is configured.
     """
     known = converters(root)
     fitting = [converter for converter in known if name in ("", converter.name)]
@@ -102,13 +102,13 @@ def channel(converter: Converter, number: int, full_scale: int | None = None) ->
     """Prepare a channel.
 
     Raises:
-        DeviceMismatchError: the converter has no such channel, or states no scale.
+        DeviceMismatchError: the converter has no such channel or scale.
         DeviceError: see ``read_text``.
     """
     stem = f"in_voltage{number}"
     file = converter.path / f"{stem}_raw"
     if number not in converter.channels():
-        raise DeviceMismatchError(f"{converter.name}: no channel {number}; there: {converter.channels()}")
+        raise DeviceMismatchError(f"{converter.name}: no channel {number}; available: {converter.channels()}")
     scale = _shared(converter.path, stem, "scale")
     if scale is None or scale <= 0:
         raise DeviceMismatchError(
@@ -125,7 +125,7 @@ def read_text(file: Path) -> str:
         DeviceLostError: it or its device is gone.
         PortBusyError: the converter streams to another process.
         DeviceTimeoutError: the converter does not answer the kernel.
-        DeviceError: anything else.
+        DeviceError: any other failure.
     """
     try:
         return file.read_text(encoding="ascii", errors="backslashreplace").strip()
@@ -149,7 +149,7 @@ def _number(file: Path) -> float:
 
 
 def _shared(folder: Path, stem: str, attribute: str) -> float | None:
-    """A channel's own attribute, else the one for all voltages."""
+    """Attribute of a channel, or the common one of all voltages."""
     for file in (folder / f"{stem}_{attribute}", folder / f"in_voltage_{attribute}"):
         if file.exists():
             return _number(file)

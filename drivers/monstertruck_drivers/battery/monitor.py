@@ -24,13 +24,13 @@ CELL_VOLTS: Final = np.array((
     3.27, 3.61, 3.69, 3.71, 3.73, 3.75, 3.77, 3.79, 3.80, 3.82, 3.84,
     3.85, 3.87, 3.91, 3.95, 3.98, 4.02, 4.08, 4.11, 4.15, 4.20,
 ))  # fmt: skip
-"""Resting voltage of a lithium-polymer cell at 0, 5 .. 100 % (table in common circulation, of no one maker)."""
+"""Resting voltage of a lithium-polymer cell at 0, 5 .. 100 % (widely used table of unknown origin)."""
 
 _CHARGES: Final = np.linspace(0.0, 1.0, len(CELL_VOLTS))
 
 
 def charge_of(cell_volts: float) -> float:
-    """Share of the capacity left at a resting cell voltage, 0..1.
+    """Remaining charge at a resting cell voltage, 0..1.
 
     Between 20 and 60 % a cell changes by 8 to 35 mV per 5 %, less than a 10-bit converter resolves behind a
     divider for six cells: no better than 0.1 either way.
@@ -43,7 +43,7 @@ class BatteryVerdict(NamedTuple):
 
     level: BatteryLevel
     voltage: float | None = None
-    """Smoothed, V; None while the sensor is at fault or too few samples came."""
+    """Smoothed voltage, V; None while the sensor is faulty or too few samples exist."""
     rest_voltage: float | None = None
     """``voltage`` without the sag (V)."""
 
@@ -71,16 +71,16 @@ class BatteryJudge:
         """Take one sample.
 
         Args:
-            time_ns: time of the sample; must not go back.
-            voltage: pack voltage, V; NaN = the converter was at an end of its scale.
-            current: motor current (A), either sign; None = unknown, no sag is removed. The pack current is smaller at
+            time_ns: time of the sample; must not decrease.
+            voltage: pack voltage, V; NaN: the converter was at an end of its scale.
+            current: motor current (A), either sign; None: unknown, no sag is removed. The pack current is smaller at
                 low motor speed, and includes the electronics: both effects are within the table's error.
         """
         elapsed = 0 if self._last is None else time_ns - self._last
         if elapsed > GAP:
             self._reset()
         self._last = time_ns
-        # An invalid sample takes part in the median as an implausible one.
+        # An invalid sample is treated by the median as an implausible one.
         volts = -math.inf if math.isnan(voltage) else voltage
         sag = min(abs(current or 0.0) * self._config.resistance, self._config.max_compensation)
         self._samples.append((volts, volts + sag))
@@ -88,7 +88,7 @@ class BatteryJudge:
             return BatteryVerdict(self._level)
         loaded, rest = (statistics.median(column) for column in zip(*self._samples, strict=True))
         if not self._config.plausible_min <= loaded <= self._config.plausible_max:
-            # Nothing measured during the fault may count; the samples stay, so that its end is noticed.
+            # Durations must not include the fault; the samples are kept, so that its end is noticed.
             samples = self._samples
             self._reset()
             self._samples = samples
@@ -133,14 +133,14 @@ LEVEL_EVENTS: Final = {
 
 
 class BatteryMonitor:
-    """Judges and publishes samples; outlives the sessions of the driver that takes them.
+    """Judges and publishes samples; outlives the sessions of the driver that provides them.
 
     Args:
         config: the pack.
-        out: where messages go.
-        events: gets an event when the level changes.
-        source: name in events.
-        drive: motor feedback for the sag; None = the voltage is judged as measured.
+        out: sink of battery messages.
+        events: sink of events, one for every change of the level.
+        source: source name of the events.
+        drive: motor feedback for the sag; None: the voltage is judged as measured.
     """
 
     def __init__(
@@ -164,9 +164,11 @@ class BatteryMonitor:
     def take(
         self, stamp: int, received: int, volts: float, *, at_limit: bool = False, current: float | None = None
     ) -> None:
-        """Take one sample, V; ``at_limit`` = the converter reads 0 or full scale: a wire of the divider is off.
+        """Process one sample (V); ``at_limit``.
 
-        ``current`` flows into the pack, A; None if it is not measured.
+        The converter reads 0 or full scale, so a wire of the divider is disconnected.
+
+        ``current`` flows into the pack, A; None if not measured.
         """
         verdict = self._judge.update(stamp, float("nan") if at_limit else volts, self._motor_current(stamp))
         level, rest = verdict.level, verdict.rest_voltage

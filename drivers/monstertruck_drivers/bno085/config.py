@@ -18,14 +18,16 @@ class Bno085Config(Schema):
     average: Annotated[int, Field(ge=1, le=20)] = 2
     """Frames averaged in one message; the unit sends 100 frames a second"""
     delay: Annotated[float, Field(ge=0, le=0.5)] = 0.006
-    """Age of a measurement when the last byte of its frame arrives, s: 19 bytes and the unit's filter"""
+    """Delay from the measurement to the last byte of its frame, s: 19 bytes and the unit's filter"""
     silence: Annotated[float, Field(gt=0, le=10)] = 0.3
-    """Seconds without a frame that end the session"""
+    """Seconds without a frame after which the session ends"""
     stuck_after: Annotated[int, Field(ge=2, le=10_000)] = 100
-    """Frames in a row with the same acceleration to the last bit that end the session: sensors are never so quiet"""
+    """Number of consecutive frames with an identical acceleration after which the session ends: real sensors have
+    noise
+    """
     gravity_tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.2
     """Tolerance of the acceleration (fraction of 1 g); beyond it, roll and pitch are not tilt"""
     correction: ImuCorrection = ImuCorrection()
     """Biases and scale of this unit"""
     frame: FrameId = "base"
-    """Frame whose axes the unit is mounted along, for its tilt"""
+    """Frame whose axes match the unit's mounting, for its tilt"""

@@ -1,4 +1,4 @@
-"""Driver of the BNO085: frames become tilt, turn rates and specific forces."""
+"""Driver of the BNO085: converts frames to tilt, turn rates and specific forces."""
 
 from math import cos, degrees, hypot, pi, sin, tau
 from typing import Final
@@ -16,7 +16,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import STANDARD_GRAVITY, Attitude, Imu
 
 LONGEST_GAP: Final = 10
-"""Maximum number of frames missing between the two of a turn rate; at 10 rad/s half a turn is 31 frames."""
+"""Maximum number of missing frames between the two of a turn rate; at 10 rad/s half a turn is 31 frames."""
 
 
 def body_rates(before: RvcFrame, after: RvcFrame) -> Xyz | None:
@@ -76,8 +76,8 @@ class Bno085Driver:
         Raises:
             DeviceLostError: unplugged.
             DeviceTimeoutError: silence.
-            ProtocolError: bytes without a frame, or the same measurement again and again.
-            WrongDeviceError: nothing that comes at the start is a frame.
+            ProtocolError: bytes without a frame, or repeated identical measurements.
+            WrongDeviceError: the bytes at the start contain no frame.
             PortBusyError: another process holds the port.
         """
         async with await self._port.open() as link:
@@ -107,7 +107,7 @@ class Bno085Driver:
                         self._publish(frame, rates, forces)
                         rates, forces = [], []
                 if equal >= self._config.stuck_after:
-                    raise ProtocolError(f"{link.name}: {equal} measurements are the same to the last bit")
+                    raise ProtocolError(f"{link.name}: {equal} measurements in a row are identical")
                 frames = await stream.receive(self._config.silence)
 
     def _publish(self, frame: RvcFrame, rates: list[Xyz], forces: list[Xyz]) -> None:
@@ -144,7 +144,7 @@ class Bno085Driver:
 
 
 async def first_frames(stream: DeviceStream[RvcFrame]) -> list[RvcFrame]:
-    """Wait for the first frames of a session; raises as ``DeviceStream.first``."""
+    """Wait for the first frames of a session; raises the errors of ``DeviceStream.first``."""
     listen = 1.0  # seconds to receive a frame at the start; the unit needs a few tenths after power-up
     return await stream.first(
         listen, "of a BNO085 in UART-RVC mode: another device, another baud rate, or PS0 and PS1 set for another mode"
@@ -155,10 +155,10 @@ async def identify(link: Link, clock: Clock, settings: Bno085Config) -> dict[str
     """Wait for one frame.
 
     Returns:
-        JSON-able: ``yaw_deg`` since power-up, ``pitch_deg``, ``roll_deg``, ``acceleration`` (m/s^2).
+        JSON-compatible: ``yaw_deg`` since power-up, ``pitch_deg``, ``roll_deg``, ``acceleration`` (m/s^2).
 
     Raises:
-        DeviceError: as the driver's ``run``.
+        DeviceError: as for the driver's ``run``.
     """
     frame = (await first_frames(DeviceStream(link, clock, RvcParser().feed)))[-1]
     yaw, pitch, roll = (round(degrees(angle), 2) for angle in frame.angles)

@@ -1,7 +1,7 @@
-"""The device side of a BNO085 in UART-RVC mode, byte for byte.
+"""Device side of a BNO085 in UART-RVC mode, byte for byte.
 
-Habits of the real thing: it streams from power-up on and hears nothing; its heading is 0 at power-up and drifts; the
-accelerometer feels the body's own acceleration, which its fusion takes out of pitch and roll only slowly.
+Behaviour of the real unit: it streams from power-up and ignores input. Its heading is 0 at power-up and drifts. The
+accelerometer also measures the body's acceleration, which the unit's fusion removes from pitch and roll only slowly.
 """
 
 from math import atan2, exp, hypot, radians
@@ -41,7 +41,7 @@ class Bno085Emulator(FaultyDevice):
         self._source = source
         self._rng = np.random.default_rng(seed)
         self.signals = Signals(clock.now, dict.fromkeys(REPORTED, SignalKind.NUMBER), self._rng)
-        drift = radians(0.5) / 60  # of the heading, rad/s, greatest
+        drift = radians(0.5) / 60  # maximum heading drift, rad/s
         self._drift = float(self._rng.uniform(-drift, drift))
         self.faults = FaultTable(
             self.name,
@@ -55,7 +55,7 @@ class Bno085Emulator(FaultyDevice):
         self.power_cycle()
 
     def power_cycle(self) -> None:
-        """Supply off and on: heading and index begin at 0."""
+        """Switch the supply off and on: heading and index restart at 0."""
         self._index, self._yaw = 0, 0.0
         self._turning = 0.0
         """Latest turn rate (rad/s)."""
@@ -65,7 +65,7 @@ class Bno085Emulator(FaultyDevice):
         self._awake_at = self._clock.now() + 300_000_000  # nanoseconds from power-up to the first frame
 
     async def run(self, end: DeviceEnd) -> None:
-        """DeviceStream until cancelled."""
+        """Stream until cancelled."""
         end.baud = BNO085_BAUD
         end.on_plug = lambda plugged: self.power_cycle() if plugged else None  # the port is its supply
         self.power_cycle()
@@ -112,5 +112,5 @@ class Bno085Emulator(FaultyDevice):
 
 
 def emulated(setup: EmulatorSetup) -> Bno085Emulator:
-    """The unit of a simulated robot."""
+    """Create the unit of a simulated robot."""
     return Bno085Emulator(setup.clock, setup.physics.imu, seed=setup.seed)

@@ -1,8 +1,8 @@
 """Frames of the BNO085's UART-RVC mode (CEVA, "BNO08X Data Sheet", section 1.3.5.2).
 
-The unit streams 100 frames a second, of 19 bytes each: AA AA, an index that counts frames, yaw, pitch and roll in
-0.01 degree, acceleration along x, y and z in 0.001 g, each signed with the low byte first, three reserved bytes, and
-the sum of the sixteen bytes from the index on. The unit takes no commands in this mode.
+The unit streams 100 frames of 19 bytes per second: AA AA, an index that counts frames, yaw, pitch and roll in 0.01
+degree, acceleration along x, y and z in 0.001 g, each signed with the low byte first, three reserved bytes, and the sum
+of the sixteen bytes starting with the index. The unit accepts no commands in this mode.
 """
 
 import struct
@@ -30,11 +30,11 @@ class RvcFrame(NamedTuple):
     number: int
     """Index of the frame, which wraps at 256."""
     yaw: int
-    """0.01 degree since power-up, -18000 to 18000."""
+    """Yaw since power-up, 0.01 degree, -18000 to 18000."""
     pitch: int
     roll: int
     x: int
-    """0.001 g."""
+    """Acceleration, 0.001 g."""
     y: int
     z: int
 
@@ -53,7 +53,7 @@ def build(frame: RvcFrame) -> bytes:
     """Return the bytes of a frame.
 
     Raises:
-        struct.error: a number beyond its bits.
+        struct.error: a number exceeds its range.
     """
     body = _BODY.pack(*frame)
     return HEADER + body + bytes((sum(body) & 0xFF,))
@@ -67,14 +67,14 @@ def measured(index: int, angles: Xyz, acceleration: Xyz) -> RvcFrame:
 
 
 class RvcParser:
-    """Collects bytes to frames; counts the bytes that belong to none."""
+    """Extracts frames from bytes; counts the bytes outside of frames."""
 
     def __init__(self) -> None:
         self.refused = 0
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> list[RvcFrame]:
-        """Return frames that became complete."""
+        """Return the completed frames."""
         self._buffer += data
         frames = []
         while (frame := self._next()) is not None:

@@ -20,26 +20,26 @@ class EposConfig(Schema):
 
     kind: Literal["epos"] = "epos"
     node: Annotated[int, Field(ge=0, le=127)] = 1
-    """Node id on the cable; 0 = any single controller."""
+    """Node id on the cable; 0: any single controller."""
     inverted: bool = True
-    """Driving forward needs negative rpm."""
+    """Whether driving forward needs negative rpm."""
 
     max_motor_rpm: Annotated[int, Field(gt=0, le=100_000)] = 18_000
-    """Set points are limited to this; also written to the controller as its own limit."""
+    """Maximum set-point, rpm; also written to the controller as its limit."""
     acceleration_rpm_s: RpmPerSecond = 60_000
     """Acceleration of the motor (rpm/s)."""
     deceleration_rpm_s: RpmPerSecond = 200_000
-    """2.4 m/s^2, below the limit of the slipper clutch; the wheels follow the motor some 0.1 s later."""
+    """Acceleration: 2.4 m/s^2, below the limit of the slipper clutch; the wheels follow the motor about 0.1 s later."""
     quick_stop_deceleration_rpm_s: RpmPerSecond = 240_000
     """Quick stop deceleration: full speed to rest in 0.08 s."""
 
     encoder_pulses_per_turn: Annotated[int, Field(gt=0, le=65_535)] | None = 500
-    """Encoder pulses per motor turn (counts / 4); None = use the controller's own setting."""
+    """Encoder pulses per motor turn (counts / 4); None: the controller's setting."""
     motor_type: Literal[1, 10, 11] | None = None
-    """1 brushed DC, 10 sinusoidal EC, 11 block commutated EC; None = do not check."""
+    """Motor type: 1 brushed DC, 10 sinusoidal EC, 11 block commutated EC; None: not checked."""
 
     rate: Annotated[float, Field(ge=1, le=25)] = 20.0
-    """Feedback per second; one cycle needs four exchanges of 10 to 13 ms at 38400 baud."""
+    """Feedback rate, Hz; one cycle needs four exchanges of 10 to 13 ms at 38400 baud."""
     status_period: Seconds = 0.1
     """Interval between readings of the controller's status (s)."""
     current_period: Annotated[float, Field(gt=0, le=2)] = 0.2
@@ -49,14 +49,14 @@ class EposConfig(Schema):
     quick_stop_after: Seconds = 1.0
     """Age of the last command at which the driver commands a quick stop (s)."""
     standstill_rpm: Annotated[int, Field(ge=1)] = 60
-    """Slower than this counts as at rest."""
+    """Speed below which the motor is at rest."""
 
     fault_resets: Annotated[int, Field(ge=0, le=10)] = 3
-    """Fault resets tried within ``fault_reset_window`` before the drive is given up."""
+    """Maximum fault resets within ``fault_reset_window``; then the drive fails."""
     fault_reset_window: Seconds = 10.0
     """Time in which ``fault_resets`` are counted (s)."""
     fault_reset_pause: Seconds = 0.3
-    """Pause between two fault resets."""
+    """Pause between two fault resets, s."""
 
     @property
     def motor_limits(self) -> MotorLimits:
@@ -68,5 +68,5 @@ class EposConfig(Schema):
 
     @property
     def stop_words(self) -> str:
-        """Node id, for the stop script."""
+        """Arguments of the stop script: the node id."""
         return str(self.node)

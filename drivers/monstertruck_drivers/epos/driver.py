@@ -53,7 +53,7 @@ def setpoint_of(command: DriveCommand | None, now: int, config: EposConfig) -> S
     Args:
         command: latest command, if any.
         now: time, ns.
-        config: sign, limits and time-outs.
+        config: sign, limits and timeouts.
 
     Returns:
         ENABLED with a target in the controller's sign, QUICK_STOP, or SWITCH_ON_DISABLED.
@@ -70,7 +70,7 @@ def setpoint_of(command: DriveCommand | None, now: int, config: EposConfig) -> S
 
 
 def sign(config: EposConfig) -> int:
-    """Controller's sign of driving forward."""
+    """Sign of driving forward at the controller."""
     return -1 if config.inverted else 1
 
 
@@ -80,7 +80,7 @@ def settled(state: State, goal: State) -> bool:
 
 
 def drive_mode(state: State) -> DriveMode:
-    """Power state as the robot sees it."""
+    """Power state as reported to the robot."""
     if state in FAULTED:
         return DriveMode.FAULT
     if state in OFF:
@@ -89,21 +89,21 @@ def drive_mode(state: State) -> DriveMode:
 
 
 class Odometer:
-    """Unwraps the controller's 32-bit position over sessions and restarts of the controller."""
+    """Unwraps the controller's 32-bit position across sessions and restarts of the controller."""
 
     def __init__(self) -> None:
         self.counts = 0
         """Counts since the daemon started, controller's sign."""
         self._last: tuple[int, int] | None = None
-        """Latest position of the controller, and its read time (ns)."""
+        """Latest position of the controller, and its time (ns)."""
 
     def update(self, raw: int, now: int, fastest: float) -> int:
-        """Add the motion since the last reading; a step no motor can make is a counter that was reset.
+        """Add the motion since the last reading; an impossible step means that the counter was reset.
 
         Args:
             raw: position of the controller, signed 32 bits.
-            now: when it was read, ns.
-            fastest: greatest counts per second of the motor.
+            now: time of the reading, ns.
+            fastest: maximum motor speed, counts/s.
 
         Returns:
             ``counts``.
@@ -111,26 +111,27 @@ class Odometer:
         if self._last is not None:
             before, then = self._last
             step = (raw - before + 2**31) % 2**32 - 2**31
-            overspeed = 1.5  # times the greatest speed: a shaft cannot have moved faster, so its counter was reset
+            overspeed = 1.5  # factor on the maximum speed: a larger step shows that the counter was reset
             if abs(step) <= overspeed * fastest * (now - then) / SECOND + 1:
                 self.counts += step
         self._last = raw, now
         return self.counts
 
     def restart(self) -> None:
-        """The controller was off in between: its next position continues here."""
+        """Continue at the next position, after the controller was off."""
         self._last = None
 
 
 SAFE_TIME = 0.225
-"""Seconds a session may take to leave the motor stopped and disabled, besides the time of the quick stop itself, from
-when the controller listens."""
+"""Maximum time at the end of a session to leave the motor stopped and disabled, in addition to the duration of the
+quick stop, measured from when the controller listens (s).
+"""
 SAFE_ATTEMPTS = 2
-"""Attempts, each with this time: the first may meet the rest of a damaged frame."""
+"""Number of attempts, each with this time: the first may meet the rest of a damaged frame."""
 STOPS = {State.QUICK_STOP: Control.QUICK_STOP, State.SWITCH_ON_DISABLED: Control.DISABLE_VOLTAGE}
-"""Controlwords that must not wait, by target state."""
+"""Controlwords that must be sent without delay, by target state."""
 SLOW_EXCHANGE = 0.03
-"""Median duration of exchanges from which the link is slow (s); at 38400 baud they take 10 to 13 ms."""
+"""Median duration of exchanges above which the link is slow (s); at 38400 baud they take 10 to 13 ms."""
 QUICK_EXCHANGE = 0.02
 """Median duration at or below which the link is no longer slow (s)."""
 
@@ -139,12 +140,12 @@ class EposDriver:
     """Service of the drive controller.
 
     Args:
-        config: see ``EposConfig``.
+        config: settings, see ``EposConfig``.
         port: port of the controller.
         clock: time.
-        commands: ``cmd/drive``; read by this driver alone.
-        out: ``sensor/drive``, ``stamp`` in the middle of the exchange that read the position.
-        events: gets the identity of the controller, and faults.
+        commands: ``cmd/drive``; this driver is its only reader.
+        out: ``sensor/drive``, with ``stamp`` in the middle of the exchange that read the position.
+        events: sink of events: identity of the controller, and faults.
         name: name of the service.
     """
 
@@ -166,26 +167,25 @@ class EposDriver:
         self.events = events
         self.odometer = Odometer()
         self.resets: list[int] = []
-        """Instants of the fault resets of the last ``fault_reset_window``."""
+        """Times of the fault resets within ``fault_reset_window``."""
         self.reported_fault: int | None = None
-        """Fault that was reported and is still there."""
+        """Reported fault that is still present."""
         self.mark: int | None = None
-        """Value of ``od.MARK`` while the controller has not restarted; None if it accepts no mark."""
+        """Value of ``od.MARK`` while the controller has not restarted; None if it rejects marks."""
         self._port = port
         self._quiet_until = 0
 
     async def run(self, ready: Ready) -> None:
-        """One session, from the stop of a motor that may still turn to the stop at its end.
+        """Run one session, from stopping a motor that may still turn to the stop at its end.
 
         Raises:
             DeviceLostError: nothing plugged in; the link went down.
             DeviceRestartedError: the controller restarted.
-            DeviceStoppedError: a motor that was to turn was stopped by another than this program.
+            DeviceStoppedError: a motor that should turn was stopped by the deadman line or another master.
             PortBusyError: another process holds the port.
-            WrongDeviceError: something else answers.
+            WrongDeviceError: another device answers.
             DeviceMismatchError: motor or encoder data contradict the configuration.
-            DeviceFaultError: a fault that resets do not clear.
-            DeviceTimeoutError, ProtocolError: no usable answers.
+            DeviceFaultError: a fault that resets do not clear. DeviceTimeoutError, ProtocolError: no usable answers.
         """
         async with await self._port.open() as link:
             line = Exchanger(link, self.clock, self.config.node, self._quiet_until)
@@ -217,20 +217,20 @@ class _DriveSession:
         self._reported = State.UNKNOWN
         """State from the statusword."""
         self._doubtful = False
-        """An exchange failed: the controller may have restarted."""
+        """Whether an exchange failed, so that the controller may have restarted."""
         self._sent_rpm: int | None = None
-        """Target in the controller; None = unknown."""
+        """Target in the controller; None: unknown."""
         self._rpm = 0
         self._current: float | None = None
         self._fault: int | None = None
         self._stopping: State | None = None
-        """QUICK_STOP or SWITCH_ON_DISABLED, if it is wanted now and its controlword was sent."""
+        """QUICK_STOP or SWITCH_ON_DISABLED, if currently wanted and its controlword was sent."""
         self._control_sent: Control | None = None
         """Latest controlword from this host."""
         self._prepared = False
-        """Mode and profile are those configured."""
+        """Whether mode and profile are set as configured."""
         self._commands_after = self._clock.now()
-        """Instant before which commands are ignored."""
+        """Time before which commands are ignored, ns."""
         self._goal = State.UNKNOWN
         self._goal_since = 0
         self._late_reported = False
@@ -242,7 +242,7 @@ class _DriveSession:
     # Begin and end
 
     async def start(self) -> None:
-        """Stop whatever moves, then find out who answers."""
+        """Stop any motion, then identify the device."""
         await self._stop_first()
         await self._line.write(od.TARGET_VELOCITY, 0, ATTEMPTS)
         self._sent_rpm = 0
@@ -261,27 +261,27 @@ class _DriveSession:
 
     async def _stop_first(self) -> None:
         try:
-            # Quick retries: a motor that kept its speed behind a lost link must rest <= 1.2 s after the link is back.
+            # Retry quickly: a motor that kept its speed during a link loss must rest <= 1.2 s after the link is back.
             handshake_attempts = 2
             await self._line.write(od.CONTROLWORD, Control.QUICK_STOP, handshake_attempts)
         except ObjectError as error:
             if error.code == od.WRONG_NODE:
                 raise DeviceMismatchError(f"{error}, configured {self._config.node}") from error
             if error.code != od.WRONG_STATE:
-                raise WrongDeviceError(f"no EPOS 24/1: {error}") from error
+                raise WrongDeviceError(f"not an EPOS 24/1: {error}") from error
         except (DeviceTimeoutError, ProtocolError) as error:
             if self._line.strange and not self._line.acknowledged:
-                raise WrongDeviceError(f"no EPOS, sends {self._line.strange[:20]!r}: {error}") from error
+                raise WrongDeviceError(f"not an EPOS, it sends {self._line.strange[:20]!r}: {error}") from error
             raise
 
     async def _check_mark(self, attempts: int = 1) -> None:
-        """Notice a controller that restarted, by the mark that it lost, and mark it again.
+        """Detect a restarted controller by its lost mark, and mark it again.
 
         Args:
             attempts: attempts of each exchange.
 
         Raises:
-            DeviceRestartedError: it did, while it was in use.
+            DeviceRestartedError: it restarted while in use.
         """
         mark = self._driver.mark
         try:
@@ -323,9 +323,9 @@ class _DriveSession:
             return
 
     async def _brake_and_switch_off(self, within: float) -> None:
-        """Repeat the quick stop until the motor rests, then switch off; ``within`` seconds in any case.
+        """Repeat the quick stop until the motor rests, then switch off; in any case after ``within`` seconds.
 
-        A motor that has not stopped by then does not obey the quick stop: without its power stage it comes to rest.
+        A motor that has not stopped by then ignores the quick stop: without its power stage it coasts to rest.
         """
         end = self._clock.now() + int(within * SECOND)
         while self._clock.now() <= end:
@@ -337,7 +337,7 @@ class _DriveSession:
     # The schedule
 
     async def serve(self, ready: Ready) -> None:
-        """Cycle after cycle until cancelled; a failed exchange is followed by the most urgent one."""
+        """Run cycles until cancelled; after a failed exchange the most urgent one follows."""
         schedule = Schedule(self._clock, self._config.rate, Lead.POLLING)
         misses, reported_ready = Misses(BRIEF_SILENCES + 2), False  # the last one follows a long silence
         while True:
@@ -369,20 +369,20 @@ class _DriveSession:
             self._current = await self._read(od.CURRENT) / 1000 * self._sign
 
     def _judge_link(self) -> None:
-        """Report a link that has become slow, or quick again."""
+        """Report a link that has become slow or fast."""
         durations = self._line.durations
         if len(durations) < RECENT:
             return
         median = sorted(durations)[RECENT // 2] / SECOND
         if median > SLOW_EXCHANGE and not self._slow:
-            text = f"answers take {median * 1000:.0f} ms: feedback comes too seldom to drive by"
+            text = f"answers take {median * 1000:.0f} ms: the feedback rate is too low for driving"
             self._report(Reason.SLOW_LINK, Severity.WARNING, text, seconds=median)
         elif median < QUICK_EXCHANGE and self._slow:
             self._report(Reason.SLOW_LINK, Severity.INFO, "answers come quickly again", seconds=median)
         self._slow = median > (QUICK_EXCHANGE if self._slow else SLOW_EXCHANGE)
 
     async def _idle(self, until: int) -> None:
-        """Wait for the next cycle; a command to stop is obeyed at once."""
+        """Wait for the next cycle; a stop command is executed at once."""
         while (left := until - self._clock.now()) > 0:
             if await self._driver.commands.next_within(left / SECOND, lambda _: not self._is_urgent()) is None:
                 return
@@ -424,7 +424,7 @@ class _DriveSession:
         )
         self._current = None
 
-    # What to do
+    # Decision
 
     def _setpoint(self) -> Setpoint:
         """Return the set-point of the latest valid command; without one a moving motor is braked, then switched off."""
@@ -441,7 +441,10 @@ class _DriveSession:
         return abs(self._rpm) > self._config.standstill_rpm
 
     async def _act(self, *, also_faster: bool = False) -> None:
-        """Send what must not wait: a quick stop, power stage off, a slower target; a faster one at a cycle's start."""
+        """Send urgent commands: a quick stop, power stage off, a lower target.
+
+        A higher target only at the start of a cycle.
+        """
         setpoint = self._setpoint()
         if setpoint.goal is State.ENABLED:
             self._stopping = None
@@ -452,12 +455,12 @@ class _DriveSession:
                 self._state = setpoint.goal
         rpm = self._target(setpoint)
         if rpm != self._sent_rpm and (also_faster or _slower(rpm, self._sent_rpm)):
-            self._sent_rpm = None  # if this fails, whether it arrived is not known
+            self._sent_rpm = None  # if this fails, it is unknown whether it arrived
             await self._line.write(od.TARGET_VELOCITY, rpm)
             self._sent_rpm = rpm
 
     def _is_urgent(self) -> bool:
-        """Whether there is something that must not wait."""
+        """Whether an urgent command is pending."""
         setpoint = self._setpoint()
         return self._is_urgent_stop(setpoint) or _slower(self._target(setpoint), self._sent_rpm)
 
@@ -484,7 +487,7 @@ class _DriveSession:
         if self._state in FAULTED:
             await self._attend_fault()
         elif self._fault is not None:
-            self._report(Reason.DEVICE_READY, Severity.INFO, f"fault {od.fault_text(self._fault)} is gone")
+            self._report(Reason.DEVICE_READY, Severity.INFO, f"fault {od.fault_text(self._fault)} cleared")
             self._fault = None
             self._commands_after = self._clock.now()
         if self._state not in FAULTED:
@@ -497,12 +500,12 @@ class _DriveSession:
             DeviceStoppedError: the motor should turn.
         """
         if self._setpoint().rpm != 0:
-            text = "quick stop by another than this program: the deadman line fell, or a second master commands"
+            text = "quick stop not ordered by this program: the deadman line fell, or a second master sends commands"
             self._report(Reason.DEVICE_STOPPED, Severity.WARNING, text)
             raise DeviceStoppedError(text)
 
     async def _step(self, goal: State) -> None:
-        """One controlword towards ``goal``."""
+        """Send one controlword towards ``goal``."""
         now = self._clock.now()
         if goal is not self._goal or settled(self._state, goal) or self._state in FAULTED:
             self._goal, self._goal_since, self._late_reported = goal, now, False
@@ -510,7 +513,7 @@ class _DriveSession:
         goal_limit = 2.0  # seconds of not following commands after which the controller is reported
         if late > goal_limit and not self._late_reported:
             self._late_reported = True
-            text = f"controller stays in {self._state.name}, wanted {goal.name}"
+            text = f"controller stays in {self._state.name}, expected {goal.name}"
             self._report(Reason.DEVICE_TIMEOUT, Severity.WARNING, text)
         control = next_control(self._state, goal)
         if control is Control.SHUTDOWN:
@@ -531,10 +534,10 @@ class _DriveSession:
                 raise
 
     async def _prepare(self) -> None:
-        """Mode, limits and ramps; a controller that was off has forgotten them.
+        """Set mode, limits and ramps, which a controller loses without power.
 
         Raises:
-            ProtocolError: the mode is not taken.
+            ProtocolError: the controller rejects the mode.
         """
         if self._prepared:
             return
@@ -573,15 +576,15 @@ class _DriveSession:
         return [await self._read(entry) & 0xFFFF for entry in od.ERROR_HISTORY[:count]]
 
     async def _reset_fault(self, now: int, code: int) -> None:
-        """One reset, by an edge of the reset bit.
+        """Reset a fault once, by an edge of the reset bit.
 
         Raises:
-            DeviceFaultError: too many of late.
+            DeviceFaultError: too many recent resets.
         """
         window = int(self._config.fault_reset_window * SECOND)
         recent = [instant for instant in self._driver.resets if now - instant < window]
         if len(recent) >= self._config.fault_resets:
-            raise DeviceFaultError(f"fault {od.fault_text(code)} stays after {len(recent)} resets")
+            raise DeviceFaultError(f"fault {od.fault_text(code)} persists after {len(recent)} resets")
         self._driver.resets = [*recent, now]
         self._reset_due = now + int(self._config.fault_reset_pause * SECOND)
         await self._control(Control.DISABLE_VOLTAGE)
@@ -592,5 +595,5 @@ class _DriveSession:
 
 
 def _slower(rpm: int, sent: int | None) -> bool:
-    """Whether a target brakes the motor compared with the one it has."""
+    """Whether a target slows the motor down compared with the current one."""
     return sent is None or abs(rpm) < abs(sent) or rpm * sent < 0

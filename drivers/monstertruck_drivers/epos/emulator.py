@@ -1,6 +1,6 @@
-"""The EPOS 24/1 as seen from the cable, byte for byte, with faults on request.
+"""Device side of the EPOS 24/1, byte for byte, with faults on request.
 
-Keeps its last speed when the host goes silent: nothing on RS232 watches the host.
+Keeps its last speed when the host goes silent: RS232 has no host watchdog.
 """
 
 import asyncio
@@ -59,9 +59,9 @@ class EposEmulator(FaultyDevice):
 
     Args:
         clock: time.
-        motor: shaft and load; None = a separate free motor.
+        motor: shaft and load; None: a separate free motor.
         seed: seed of delays and noise.
-        node: node id it answers to (besides 0).
+        node: its node id (in addition to 0).
     """
 
     def __init__(self, clock: Clock, motor: MotorPlant | None = None, *, seed: int = 0, node: int = 1) -> None:
@@ -69,11 +69,11 @@ class EposEmulator(FaultyDevice):
         self.firmware = Firmware(clock.now, motor or FreeMotor(), np.random.default_rng(seed))
         self.signals = self.firmware.signals
         self.received: deque[tuple[int, bytes]] = deque(maxlen=4096)
-        """Latest bytes from the host, with their instants."""
+        """Latest bytes from the host with their times."""
         self.frames: deque[tuple[int, Frame]] = deque(maxlen=1024)
         """Latest frames accepted from the host."""
         self.repeat_refused = False
-        """An answer the host refuses is sent again (it is not documented whether the real one does)."""
+        """Whether an answer rejected by the host is repeated (undocumented for the real controller)."""
         self._clock = clock
         self._node = node
         self._inbox = bytearray()
@@ -81,7 +81,7 @@ class EposEmulator(FaultyDevice):
         self._powered: asyncio.Timeout | None = None
         self._booted_at = 0
         self._delay, self._delayed = 0.0, 0
-        """Time that answers come later (s), and the number of them."""
+        """Additional delay of answers (s), and the number of delayed answers."""
         self._long: tuple[bytes, bool] = (b"", False)
         self.faults = FaultTable(
             self.name,
@@ -104,12 +104,12 @@ class EposEmulator(FaultyDevice):
     # Faults and switches
 
     def power_cycle(self) -> None:
-        """Supply off and on: comes back switch-on disabled, with target 0 and stored settings."""
+        """Switch the supply off and on: it returns switch-on disabled, with target 0 and stored settings."""
         self._switch_power(False)
         self._switch_power(True)
 
     def set_quick_stop_input(self, active: bool) -> None:
-        """The hardware deadman line on a digital input: while active the controller stops by itself."""
+        """Hardware deadman line on a digital input: while active the controller stops by itself."""
         self.firmware.set_quick_stop_input(active)
 
     def _inject_fault(self, name: str, *passing: str) -> None:
@@ -146,9 +146,9 @@ class EposEmulator(FaultyDevice):
             self.firmware.shut_down()
         elif on and not self._power:
             self.firmware.boot()
-            self._booted_at = self._clock.now() + int(0.4 * SECOND)  # from power to the first answer
+            self._booted_at = self._clock.now() + int(0.4 * SECOND)  # time from power-up to the first answer
         self._power = on
-        if self._powered is not None and not self._powered.expired():  # whatever exchange is under way ends here
+        if self._powered is not None and not self._powered.expired():  # an exchange in progress ends here
             self._powered.reschedule(0)
 
     def _delays(self) -> bool:
@@ -174,9 +174,9 @@ class EposEmulator(FaultyDevice):
                 await watch
 
     async def _watch(self) -> None:
-        """A controller lives without being asked: supply faults stop the motor."""
+        """Simulate the controller between requests: supply faults stop the motor."""
         while True:
-            await self._clock.sleep(0.05)  # seconds between checks of the supply while no host asks anything
+            await self._clock.sleep(0.05)  # seconds between checks of the supply without requests
             if self._power:
                 self.firmware.advance()
 
@@ -186,7 +186,7 @@ class EposEmulator(FaultyDevice):
             opcode = (await self._take(end, 1))[0]
             try:
                 await self._exchange(end, opcode)
-            except TimeoutError:  # a half frame is dropped without a word
+            except TimeoutError:  # an incomplete frame is dropped silently
                 self._inbox.clear()
 
     async def _exchange(self, end: DeviceEnd, opcode: int) -> None:
@@ -241,7 +241,7 @@ class EposEmulator(FaultyDevice):
         end.write(data, turn_around)
 
     async def _within(self, end: DeviceEnd, count: int) -> bytes:
-        """Bytes of a frame; too long a pause raises ``TimeoutError``."""
+        """Bytes of a frame; a pause that is too long raises ``TimeoutError``."""
         return await self._take(end, count, self.firmware.frame_timeout)
 
     async def _take(self, end: DeviceEnd, count: int, pause: float | None = None) -> bytes:
@@ -297,7 +297,7 @@ class EposEmulator(FaultyDevice):
 
 
 def emulated(setup: EmulatorSetup) -> EposEmulator:
-    """The controller of one driven shaft of a simulated truck, on a line of real speed."""
+    """Create the controller of one driven shaft of a simulated truck, on a line of realistic speed."""
     shaft = SHAFTS.index(DeviceRole(setup.role))
     setup.port.device.baud = EPOS_BAUD
     return EposEmulator(setup.clock, setup.physics.motors[shaft], seed=setup.seed + shaft)

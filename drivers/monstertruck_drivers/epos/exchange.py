@@ -1,4 +1,4 @@
-"""The byte handshake of the EPOS over a link: one exchange at a time, with its time-outs and recovery."""
+"""Byte handshake of the EPOS over a link: one exchange at a time, with timeouts and recovery."""
 
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -34,14 +34,13 @@ from monstertruck_runtime.errors import DeviceMismatchError, DeviceTimeoutError,
 T = TypeVar("T")
 
 QUIET = 0.55
-"""Silence that makes a controller with factory settings drop half a frame with certainty (s)."""
+"""Silence that reliably makes a controller with factory settings drop an incomplete frame (s)."""
 QUICK_ANSWER = 0.05
-"""Maximum duration of the latest exchanges on a quick line (s): a byte that has not arrived by then is lost, not
-late."""
+"""Maximum duration of recent exchanges on a fast line (s): there a missing byte is lost, not late."""
 RECENT = 32
 """Exchanges whose duration is judged."""
 ATTEMPTS = 3
-"""Attempts at an exchange outside the schedule."""
+"""Number of attempts at an exchange outside the schedule."""
 BRIEF_SILENCES = 2
 """Maximum consecutive failures that need a brief silence only. The second failure most likely has the same cause as the
 first, as the request is repeated within some 130 ms; a controller that lost the time-out set by the host needs a long
@@ -73,7 +72,7 @@ class Exchanger:
         link: open link to the controller.
         clock: time.
         node: node id.
-        quiet_until: end of the silence that an earlier link requires (ns).
+        quiet_until: end of the silence required by an earlier link (ns).
     """
 
     def __init__(self, link: Link, clock: Clock, node: int, quiet_until: int = 0) -> None:
@@ -82,36 +81,36 @@ class Exchanger:
         self._node = node
         self._flight: Transaction[Any] | None = None
         self._hurried = False
-        """A task waits for the end of the exchange that is read."""
+        """Task that waits for the end of the exchange being read."""
         self.quiet_until = quiet_until
         """Time when the controller listens again (ns); in the past during normal operation."""
         self.strange = b""
         """Latest unexpected bytes."""
         self.acknowledged = False
-        """True once something answered as an EPOS does."""
+        """True once a device has answered as an EPOS does."""
         self.began = 0
-        """Instant of the first byte of the latest exchange."""
+        """Time of the first byte of the latest exchange, ns."""
         self.ended = 0
-        """Instant of the last byte of the latest complete exchange."""
+        """Time of the last byte of the latest complete exchange, ns."""
         self.durations: deque[int] = deque(maxlen=RECENT)
         """Durations of the latest complete exchanges (ns)."""
         self._frame_timeout: float | None = None
-        """Timeout for half frames that the host has set in the controller (s); None for the factory setting."""
+        """Timeout for incomplete frames that the host has set in the controller (s); None: the factory setting."""
         self._answer_awaited = False
-        """The controller has the request, so late bytes are its answer."""
+        """Whether the controller has the request, so that late bytes are its answer."""
         self._failures = 0
-        """Exchanges in a row that failed."""
+        """Number of consecutive failed exchanges."""
         self._silence = QUIET
         """Silence required after the latest failure (s)."""
         self._touched = 0
-        """Instant of the latest byte from either side."""
+        """Time of the latest byte from either side, ns."""
 
     async def read(self, entry: ObjectEntry, attempts: int = 1) -> int:
-        """Value of an object.
+        """Read the value of an object.
 
         Raises:
-            ObjectError: the controller refuses.
-            DeviceTimeoutError, ProtocolError: no usable answer in ``attempts`` tries.
+            ObjectError: the controller refuses. DeviceTimeoutError, ProtocolError: no usable answer in ``attempts``
+            tries.
             DeviceLostError: the link is down.
         """
         return self._value(entry, await self._answer(read_request(entry, self._node), entry, attempts))
@@ -127,7 +126,7 @@ class Exchanger:
         await self._transact(self._run_row(entries, take))
 
     async def write(self, entry: ObjectEntry, value: int, attempts: int = 1) -> None:
-        """Set an object.
+        """Write an object.
 
         Raises:
             ValueError: ``value`` does not fit the object.
@@ -136,13 +135,13 @@ class Exchanger:
         await self._answer(write_request(entry, value, self._node), entry, attempts, value)
 
     async def shorten_silence(self) -> None:
-        """Have the controller drop half frames soon, where it can: a damaged byte then costs less.
+        """Make the controller drop incomplete frames soon, if it supports that: a damaged byte then costs less time.
 
         Raises:
             DeviceTimeoutError, ProtocolError, DeviceLostError: as ``read``.
         """
         quick = max(self.durations, default=SECOND) <= QUICK_ANSWER * SECOND
-        # Timeout of a half frame that the host sets on a quick line: no good frame takes longer.
+        # Timeout of an incomplete frame set by the host on a fast line: no valid frame takes longer.
         quick_frame_timeout_ms = 50
         # The same on other lines: more than the host waits for an acknowledge, so that only damage meets it.
         frame_timeout_ms = 120
@@ -152,7 +151,7 @@ class Exchanger:
             self._frame_timeout = milliseconds / 1000
 
     async def read_long(self, entry: ObjectEntry) -> bytes:
-        """Raw bytes of an object of more than 32 bits, by segments.
+        """Read the raw bytes of an object of more than 32 bits, by segments.
 
         Raises:
             ObjectError, DeviceTimeoutError, ProtocolError, DeviceLostError: as ``read``.
@@ -173,13 +172,13 @@ class Exchanger:
         raise ProtocolError(f"{self._link.name}: {entry}: more than {segment_limit} segments")
 
     async def finish(self) -> None:
-        """Wait for the exchange whose caller was cancelled, if there is one; its outcome does not matter."""
+        """Wait for the exchange whose caller was cancelled, if any; ignore its outcome."""
         if self._flight is not None:
             self._hurried = True
             await self._flight.end()
 
     async def close(self) -> None:
-        """Give up an exchange that is still under way."""
+        """Abandon an exchange in progress."""
         if self._flight is not None:
             self._flight.cancel()
 
@@ -216,12 +215,14 @@ class Exchanger:
                 self._flight = None  # its error's traceback holds this exchanger
 
     async def settle(self) -> None:
-        """Let the controller forget a half frame: silence on the line, from both sides.
+        """Make the controller drop an incomplete frame, by silence on the line from both sides.
 
         Raises:
             DeviceLostError: the link went down.
         """
-        quiet_limit = 1.1  # maximum wait for silence (s); a line that is never silent is no EPOS, and is used anyway
+        quiet_limit = (
+            1.1  # maximum wait for silence (s); a line that is never silent is not an EPOS, and is used anyway
+        )
         limit = self._clock.now() + int(quiet_limit * SECOND)
         while (left := min(self.quiet_until, limit) - self._clock.now()) > 0:
             with suppress(TimeoutError):
@@ -249,7 +250,7 @@ class Exchanger:
         self.quiet_until = last + round(self._silence * SECOND)
 
     def _is_quick(self) -> bool:
-        """Whether a byte that did not come in time is lost, not late as on a slow link. The retry finds out which."""
+        """Whether a byte that did not arrive in time is lost, not late as on a slow link. The retry shows which."""
         return not self._failures and len(self.durations) == RECENT and max(self.durations) <= QUICK_ANSWER * SECOND
 
     def _run_row(self, entries: Sequence[ObjectEntry], take: Callable[[int], bool]) -> Steps[None]:
@@ -261,7 +262,7 @@ class Exchanger:
                 return
 
     def _run(self, request: Frame) -> Steps[Frame]:
-        """One exchange; whatever goes wrong in its middle is followed by silence."""
+        """Run one exchange; any failure within it is followed by silence."""
         self.began = self._clock.now()
         self._answer_awaited = False
         try:
@@ -292,7 +293,7 @@ class Exchanger:
             self._write(request.body)
             if (yield from self._acknowledge()) == READY:
                 return
-        raise ProtocolError(f"{self._link.name}: frame refused twice")
+        raise ProtocolError(f"{self._link.name}: frame rejected twice")
 
     def _ask(self, request: Frame) -> Steps[None]:
         busy_retries = 3
@@ -324,7 +325,7 @@ class Exchanger:
         return stray
 
     def _receive(self, lengths: frozenset[int] | None) -> Steps[Frame | None]:
-        """Answer frame; None = damaged, and the controller has forgotten it: ask again."""
+        """Read the answer frame; None: it is damaged and the controller has dropped it: ask again."""
         self._answer_awaited = True
         skipped = b""
         answer_timeout = 0.25
@@ -342,12 +343,12 @@ class Exchanger:
         return frame
 
     def _repeated(self, lengths: frozenset[int] | None) -> Steps[Frame | None]:
-        """Refuse a damaged answer; listen whether the controller repeats or forgets it, which is undocumented."""
+        """Reject a damaged answer; check whether the controller repeats or drops it, which is undocumented."""
         yield WaitFor(0, 0.005)  # seconds within which the rest of a damaged answer arrives
         self._link.discard()
         self._write(bytes((REFUSED,)))
         try:
-            repeat_wait = 0.03  # seconds within which a controller starts to repeat a refused answer
+            repeat_wait = 0.03  # seconds within which a controller starts to repeat a rejected answer
             return (yield from self._frame(lengths, repeat_wait))
         except DeviceTimeoutError:
             return None
@@ -381,20 +382,23 @@ class Exchanger:
 
     def _check_held_up(self, asked: int) -> None:
         if (waited := (self._clock.now() - asked) / SECOND) >= QUIET:
-            raise _HeldUpError(f"{self._link.name}: this process stood still for {waited:.1f} s")
+            raise _HeldUpError(f"{self._link.name}: this process was suspended for {waited:.1f} s")
 
 
 class _BusyError(Exception):
-    """The controller refused the opcode again and again; nothing is half sent."""
+    """Error for an opcode that the controller refuses repeatedly; no frame is incomplete."""
 
 
 class _HeldUpError(Exception):
-    """The wait outlasted its own limit: the controller has long dropped this exchange and accepts a new one at once."""
+    """Whether the wait exceeded its limit.
+
+    The controller has long dropped this exchange and accepts a new one at once.
+    """
 
 
 @dataclass(frozen=True, slots=True)
 class ControllerIdentity:
-    """Settings of a controller; None where it lacks the object."""
+    """Settings of a controller; None for missing objects."""
 
     software: int
     hardware: int | None
@@ -415,7 +419,7 @@ class ControllerIdentity:
         """Position counts per motor turn.
 
         Raises:
-            DeviceMismatchError: neither the controller nor the configuration states them.
+            DeviceMismatchError: neither the controller nor the configuration defines them.
         """
         pulses = self.encoder_pulses_per_turn or config.encoder_pulses_per_turn
         if pulses is None:
@@ -426,7 +430,7 @@ class ControllerIdentity:
         """Compare with the configuration.
 
         Raises:
-            DeviceMismatchError: driving would be wrong by a factor, or with a motor of another kind.
+            DeviceMismatchError: driving would be wrong by a factor, or the motor type differs.
         """
         expected: tuple[tuple[ObjectEntry, int | None, int | None], ...] = (
             (od.ENCODER_PULSES, self.encoder_pulses_per_turn, config.encoder_pulses_per_turn),
@@ -458,7 +462,7 @@ async def read_identity(line: Exchanger) -> ControllerIdentity:
 
     software = await ask(od.SOFTWARE_VERSION)
     if software is None:
-        raise WrongDeviceError(f"controller without {od.SOFTWARE_VERSION}: not an EPOS 24/1, or not this node")
+        raise WrongDeviceError(f"controller without {od.SOFTWARE_VERSION}: not an EPOS 24/1, or another node id")
     return ControllerIdentity(
         software=software,
         hardware=await ask(od.HARDWARE_VERSION),

@@ -1,4 +1,4 @@
-"""Inside of the emulated EPOS: objects, power states, velocity profile, faults. Knows no bytes."""
+"""Firmware of the emulated EPOS: objects, power states, velocity profile, faults; independent of the protocol."""
 
 import math
 from collections.abc import Callable
@@ -64,7 +64,7 @@ ORDERED = (
 """Objects whose values move the motor."""
 
 POWER_ORDERS = ("disable_voltage", "quick_stop", "halt", "enable", "fault_reset")
-"""Orders of controlwords."""
+"""Power orders of controlwords."""
 
 
 def signal_name(entry: ObjectEntry) -> str:
@@ -73,7 +73,7 @@ def signal_name(entry: ObjectEntry) -> str:
 
 
 def power_order(word: int) -> str:
-    """Return which of ``POWER_ORDERS`` a controlword is."""
+    """Return the power order of a controlword, one of ``POWER_ORDERS``."""
     if word & Control.FAULT_RESET:
         return "fault_reset"
     if not word & 0x02:
@@ -91,7 +91,7 @@ def signals(now: Callable[[], int], rng: np.random.Generator) -> Signals:
 
 
 VOLATILE = (od.CONTROLWORD, od.TARGET_VELOCITY, od.MODE)
-"""Never stored: 0 (mode: its default) after power-up."""
+"""Objects that are never stored: 0 (mode: its default) after power-up."""
 
 RANGES: dict[ObjectEntry, tuple[int, int]] = {
     od.NODE_ID: (1, 127),
@@ -109,7 +109,7 @@ SERIAL = bytes.fromhex("6301602400001234")
 
 
 class AccessRefusedError(Exception):
-    """An object access ends with a communication error code."""
+    """An object access that ends with a communication error code."""
 
     def __init__(self, code: int) -> None:
         super().__init__(od.abort_text(code))
@@ -161,8 +161,8 @@ class Firmware:
 
     Args:
         now: time, ns.
-        motor: shaft and its load.
-        rng: source of noise and of the states' delays.
+        motor: shaft with its load.
+        rng: random numbers for noise and delays of the states.
     """
 
     def __init__(self, now: Callable[[], int], motor: MotorPlant, rng: np.random.Generator) -> None:
@@ -171,15 +171,17 @@ class Firmware:
         self._motor = motor
         self._rng = rng
         self.strict_transitions = False
-        """Answer an impossible controlword with "wrong device state" instead of ignoring it."""
+        """Whether to answer an impossible controlword with "wrong device state" instead of ignoring it."""
         self.latched_quick_stop = False
-        """Quick stop ends only through power stage off (the real controller's behaviour is uncertain)."""
-        self.over_voltage_above = 27.0  # volts; the real limit is not known
+        """Whether a quick stop can be left only through power stage off (the real controller's behaviour is
+        uncertain).
+        """
+        self.over_voltage_above = 27.0  # volts; the real limit is unknown
         self.causes: set[int] = set()
-        """Injected fault codes whose cause is still present; supply faults come and go by themselves."""
+        """Injected fault codes whose cause is still present; supply faults start and end by themselves."""
         self.quick_stop_input = False
         self.runaway: DisobedientMotor | None = None
-        """How the power stage departs from the commands."""
+        """Deviation of the power stage from the commands."""
         self._live: dict[ObjectEntry, Callable[[MotorReading], int]] = {
             od.STATUSWORD: self._statusword,
             od.POSITION: self._position,
@@ -211,7 +213,7 @@ class Firmware:
         self._current_average = reading.current_ma
 
     def shut_down(self) -> None:
-        """Supply lost: the power stage is off."""
+        """Handle loss of the supply: the power stage is off."""
         self._set(State.NOT_READY)
 
     @staticmethod
@@ -220,13 +222,13 @@ class Firmware:
 
     @property
     def frame_timeout(self) -> float:
-        """Silence after which a half frame is dropped (s)."""
+        """Silence after which an incomplete frame is dropped (s)."""
         return self._values[od.RS232_TIMEOUT] / 1000
 
     # Objects
 
     def read(self, index: int, sub: int) -> int:
-        """32 bits of an object.
+        """Read an object, 32 bits.
 
         Raises:
             AccessRefusedError: no such object, or not readable.
@@ -250,7 +252,7 @@ class Firmware:
         return SERIAL if entry is od.SERIAL_NUMBER else self.read(index, sub).to_bytes(4, "little")[: entry.width // 8]
 
     def write(self, index: int, sub: int, raw: int) -> None:
-        """Set an object.
+        """Write an object.
 
         Raises:
             AccessRefusedError: no such object, read-only, out of range, or wrong state.
@@ -273,7 +275,7 @@ class Firmware:
             self._apply(entry, value)
 
     def _obey(self, word: int) -> None:
-        """A controlword; without supply none is obeyed, however late it is."""
+        """Execute a controlword; without supply none is executed."""
         if self.state is not State.NOT_READY:
             self._control(word)
 
@@ -295,7 +297,7 @@ class Firmware:
         return (counts + 2**31) % 2**32 - 2**31
 
     def _velocity(self, reading: MotorReading) -> int:
-        """Counts within 1 ms, as rpm: coarse."""
+        """Velocity as counts within 1 ms, in rpm: coarse."""
         per_ms = self._values[od.ENCODER_PULSES] * od.COUNTS_PER_PULSE / 60_000
         return round(round(reading.rpm * per_ms + self._rng.uniform(-0.5, 0.5)) / per_ms)
 
@@ -352,7 +354,7 @@ class Firmware:
                 self._command_motor()
 
     def _transition(self, word: int) -> State | None:
-        """State a controlword asks for; None = impossible from here."""
+        """State requested by a controlword; None: impossible from the current state."""
         if not word & 0x02:
             return State.SWITCH_ON_DISABLED
         if not word & 0x04:
@@ -368,7 +370,7 @@ class Firmware:
         return State.ENABLED if self.state in (State.SWITCHED_ON, *POWERED) else None
 
     def set_quick_stop_input(self, active: bool) -> None:
-        """The hardware line: while active the motor is stopped and cannot be enabled."""
+        """Set the hardware line: while active the motor is stopped and cannot be enabled."""
         self.advance()
         self.quick_stop_input = active
         if active and self.state is State.ENABLED:
@@ -379,15 +381,18 @@ class Firmware:
             self._command_motor()
 
     def fail(self, code: int) -> None:
-        """A fault: history, reaction, power stage off."""
+        """Handle a fault: history, reaction, power stage off."""
         self._history = [code, *self._history][: od.HISTORY_SIZE]
         running = self.state in POWERED
         self._set(State.FAULT_REACTION_ENABLED if running else State.FAULT_REACTION_DISABLED)
-        reaction_time = 0.05  # seconds a fault reaction lasts before the state is FAULT
+        reaction_time = 0.05  # duration of a fault reaction before the state is FAULT (s)
         self._pending = (self._now() + int(reaction_time * SECOND), State.FAULT)
 
     def advance(self) -> MotorReading:
-        """Let time-driven things happen: filters, supply faults, states that pass; the motor as it is then."""
+        """Update everything that depends on time: filters, supply faults, transient states.
+
+        Return the motor's state.
+        """
         now, state = self._now(), self.state
         reading = self._motor.reading(now)
         then, turns = self._seen
@@ -417,7 +422,7 @@ class Firmware:
             self._command_motor()
 
     def run_away(self, runaway: DisobedientMotor | None) -> None:
-        """Depart from the commands from now on; None = obey again."""
+        """Deviate from the commands from now on; None: obey again."""
         self.advance()
         self.runaway = runaway
         self._command_motor()
@@ -439,7 +444,7 @@ class Firmware:
         self._motor.command(now, target, float(ramp))
 
     def _demand(self, rpm: float) -> tuple[float | None, int]:
-        """Commanded speed (None = power stage off), and its ramp, rpm/s."""
+        """Commanded speed (None: power stage off), and its ramp, rpm/s."""
         match self.state:
             case State.ENABLED:
                 target = self._target()

@@ -1,4 +1,4 @@
-"""Read a controller without moving or changing anything."""
+"""Read a controller without moving or changing it."""
 
 from typing import Any
 
@@ -17,22 +17,22 @@ async def identify(link: Link, clock: Clock, settings: EposConfig) -> dict[str, 
     Args:
         link: open line to the controller.
         clock: time.
-        settings: with its node id.
+        settings: driver settings with the node id.
 
     Returns:
-        JSON-able report in the controller's own units and sign.
+        JSON-compatible report in the controller's own units and sign.
 
     Raises:
         DeviceLostError: the link went down.
         DeviceTimeoutError, ProtocolError: no usable answers.
-        WrongDeviceError: something else answers.
+        WrongDeviceError: another device answers.
     """
     line = Exchanger(link, clock, settings.node)
     try:
         return await _report(line, clock)
     except (DeviceTimeoutError, ProtocolError) as error:
         if line.strange and not line.acknowledged:
-            raise WrongDeviceError(f"no EPOS, sends {line.strange[:20]!r}: {error}") from error
+            raise WrongDeviceError(f"not an EPOS, it sends {line.strange[:20]!r}: {error}") from error
         raise
     finally:
         await line.close()

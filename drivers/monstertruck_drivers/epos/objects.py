@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObjectEntry:
-    """One object: its address, width in bits, sign and access (``ro``, ``wo``, ``rw``); there is one of each."""
+    """One object: address, width in bits, sign and access (``ro``, ``wo``, ``rw``)."""
 
     name: str
     index: int
@@ -34,7 +34,7 @@ class ObjectEntry:
         return value & 0xFFFFFFFF
 
     def decode(self, raw: int) -> int:
-        """Value from 32 bits, cut to the object's own size first."""
+        """Decode the value from 32 bits, truncated to the object's size."""
         value = raw & ((1 << self.width) - 1)
         return value - (1 << self.width) if self.signed and value >> (self.width - 1) else value
 
@@ -99,7 +99,7 @@ OBJECTS: dict[tuple[int, int], ObjectEntry] = {
 """Every object of this module by (index, subindex)."""
 
 PROFILE_VELOCITY = 3
-"""Value of ``MODE``: follow the target velocity with the profile's ramps."""
+"""Value of ``MODE``: profile velocity mode."""
 RPM = 0
 """Value of ``VELOCITY_NOTATION``."""
 SAVE = 0x65766173

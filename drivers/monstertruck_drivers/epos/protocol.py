@@ -10,7 +10,7 @@ One exchange, strictly one at a time (``>`` host, ``<`` controller)::
 
 Words are 16 bits, low byte first on the wire; the CRC sees them high byte first.
 
-This module needs nothing but the standard library, so that a stop script can use its bytes.
+This module needs only the standard library, so that a stop script can use it.
 """
 
 import binascii
@@ -23,7 +23,7 @@ from typing import NamedTuple
 from monstertruck_drivers.epos.objects import CONTROLWORD, ObjectEntry
 
 EPOS_BAUD = 38400
-"""Baud rate of the RS232 line, as set in the author's controller."""
+"""Baud rate of the RS232 line in the author's controller."""
 
 READY = 0x4F
 """'O': ready for the next bytes, or accepted."""
@@ -67,12 +67,12 @@ class Frame(NamedTuple):
 
     @property
     def head(self) -> bytes:
-        """The byte that asks for permission to send ``body``."""
+        """Byte that requests permission to send ``body``."""
         return bytes((self.opcode,))
 
     @property
     def body(self) -> bytes:
-        """Everything after the opcode: length-1, words, CRC."""
+        """All bytes after the opcode: length-1, words, CRC."""
         words = (*self.words, checksum(self.opcode, self.words))
         return struct.pack(f"<B{len(words)}H", len(self.words) - 1, *words)
 
@@ -88,15 +88,15 @@ def checksum(opcode: int, words: Sequence[int]) -> int:
 
 
 def body_size(length_byte: int) -> int:
-    """Bytes that follow the length byte: words and CRC."""
+    """Number of bytes after the length byte: words and CRC."""
     return 2 * (length_byte + 2)
 
 
 def decode_body(opcode: int, body: bytes) -> Frame:
-    """Frame from ``body`` (length byte first).
+    """Parse a frame from ``body`` (length byte first).
 
     Raises:
-        FrameError: size or CRC do not fit.
+        FrameError: size or CRC is wrong.
     """
     if not body or len(body) != 1 + body_size(body[0]):
         raise FrameError(f"frame of {len(body)} bytes does not match its length byte")
@@ -167,7 +167,7 @@ def error_of(frame: Frame) -> int:
     """Error code of an answer; 0 = ok.
 
     Raises:
-        FrameError: too short to hold one.
+        FrameError: too short for an error code.
     """
     if len(frame.words) < 2:
         raise FrameError("answer without an error code")
@@ -175,7 +175,7 @@ def error_of(frame: Frame) -> int:
 
 
 def split(value: int) -> tuple[int, int]:
-    """Unsigned 32 bits as words, low word first."""
+    """Split 32 bits into words, low word first."""
     return value & 0xFFFF, value >> 16
 
 
@@ -212,7 +212,7 @@ class State(Enum):
     FAULT_REACTION_ENABLED = 0x011F
     FAULT = 0x0108
     UNKNOWN = -1
-    """A bit pattern no document lists; treated as passing through."""
+    """Undocumented bit pattern; treated as a transient state."""
 
 
 STATE_MASK = 0x417F
@@ -242,10 +242,10 @@ _STEPS: dict[State, dict[State, Control]] = {
 
 
 def next_control(state: State, goal: State) -> Control | None:
-    """Controlword that brings ``state`` one step closer to ``goal``; None = wait, or there already.
+    """Controlword that brings ``state`` one step closer to ``goal``; None: wait, or already there.
 
     Args:
-        state: where the controller is.
+        state: current state.
         goal: ENABLED, QUICK_STOP (or off, if it was not running) or SWITCH_ON_DISABLED.
     """
     return _STEPS[goal].get(state)

@@ -13,28 +13,30 @@ class ScipConfig(ScannerConfig):
     """How a scanner that speaks SCIP is driven; its geometry is always read from the sensor itself."""
 
     SERIES: ClassVar[tuple[str, ...]]
-    """One of these is in the name of the product or of the model."""
+    """Series names, one of which is part of the product or model name."""
 
     serial_number: str | None = None
-    """Unit expected on this port (``SERI`` of VV); None accepts any."""
+    """Serial number expected on this port (``SERI`` of VV); None: any."""
     scan_format: Literal["MD", "MS"] = "MD"
-    """MD: three characters a range; MS: two, at most 4095 mm, two thirds of the bytes."""
+    """MD: three characters per range; MS: two, at most 4095 mm, two thirds of the bytes."""
     cluster: Annotated[int, Field(ge=1, le=99)] = 1
-    """Neighbouring steps merged into one range; over RS232 use 2 or more, a full scan does not fit in 100 ms."""
+    """Number of neighbouring steps merged into one range; over RS232 use 2 or more, because a full scan does not fit in
+    100 ms.
+    """
     skip: Annotated[int, Field(ge=0, le=9)] = 0
-    """Revolutions left out between two scans."""
+    """Number of revolutions skipped between two scans."""
     max_bad_scans: Annotated[int, Field(ge=0)] = 5
-    """Damaged scans in a row that are tolerated before the session restarts."""
+    """Maximum number of consecutive damaged scans before the session restarts."""
     stale_periods: Annotated[float, Field(gt=1)] = 5.0
-    """Scan intervals without a good scan before the session restarts."""
+    """Number of scan intervals without a valid scan before the session restarts."""
     first_scan_periods: Annotated[float, Field(gt=1)] = 16.0
-    """Scan intervals allowed for the first scan after starting."""
+    """Number of scan intervals allowed for the first scan after starting."""
     line_timeout: Annotated[float, Field(gt=0)] = 0.14
-    """Seconds of silence within the answer to a command."""
+    """Maximum silence within the answer to a command, s."""
     verify_timeout: Annotated[float, Field(gt=0)] = 10.0
     """Time limit for the sensor to verify a suspected internal fault (s, statuses 21-49)."""
     clock_samples: Annotated[int, Field(ge=1, le=100)] = 12
-    """Exchanges of the start-up clock comparison; the quickest one counts."""
+    """Number of exchanges of the start-up clock comparison; the fastest one is used."""
 
     @property
     def sheet(self) -> RangeSheet:
@@ -57,11 +59,11 @@ class HokuyoLxConfig(ScipConfig, ReturnsConfig):
 
     kind: Literal["hokuyo_lx"] = "hokuyo_lx"
     model: Literal["ust_10lx", "ust_20lx", "utm_30lx"] = "ust_10lx"
-    """Which one is emulated, and how far the gate relies on it; the driver reads the geometry from the sensor"""
+    """Emulated model, and the range on which the gate relies; the driver reads the geometry from the sensor"""
     stale_periods: Annotated[float, Field(gt=1)] = 20.0
-    """Scan intervals (25 ms) without a good scan before the session restarts."""
+    """Number of scan intervals (25 ms) without a valid scan before the session restarts."""
     first_scan_periods: Annotated[float, Field(gt=1)] = 60.0
-    """Scan intervals allowed for the first scan after starting."""
+    """Number of scan intervals allowed for the first scan after starting."""
 
     @property
     def sheet(self) -> RangeSheet:

@@ -1,7 +1,7 @@
-"""The scanner as a service, and the session with it.
+"""The scanner as a service, and its session.
 
-A session wakes the scanner from any state, asks, compares clocks and silences it; the driver streams scans in one
-until it is cancelled or lost.
+A session wakes the scanner from any state, identifies it, compares clocks and silences it; the driver streams scans in
+a session until it is cancelled or lost.
 """
 
 import contextlib
@@ -52,13 +52,13 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
 
 TRANSFER = 0.002
-"""Seconds assumed from the last beam to the arrival where it cannot be measured."""
+"""Assumed time from the last beam to the arrival if it cannot be measured (s)."""
 ANSWER_LIMIT = 2.0
-"""Seconds for a whole answer, also over a slow RS232 line."""
+"""Timeout for a complete answer, also over a slow RS232 line (s)."""
 
 
 class Dialect(StrEnum):
-    """Language of the sensor."""
+    """Protocol version of the sensor."""
 
     SCIP1 = "SCIP 1.1"
     SCIP2 = "SCIP 2.0"
@@ -76,7 +76,7 @@ class Sensor:
 
 
 class ScipSession:
-    """Asks one thing at a time over an open link."""
+    """Sends one request at a time over an open link."""
 
     def __init__(self, link: Link, clock: Clock, config: ScipConfig) -> None:
         self.parser = ScipParser()
@@ -90,10 +90,10 @@ class ScipSession:
         self._dialect = Dialect.SCIP2
 
     async def next_reply(self, seconds: float) -> Reply:
-        """The next reply, whatever it answers.
+        """Receive the next reply, whichever request it answers.
 
         Raises:
-            DeviceTimeoutError: none was complete within ``seconds``.
+            DeviceTimeoutError: no complete reply within ``seconds``.
             DeviceLostError: the link went down.
         """
         end = self._clock.now() + round(seconds * SECOND)
@@ -105,7 +105,7 @@ class ScipSession:
         return self._replies.popleft()
 
     async def ask(self, command: str) -> Reply:
-        """Send a command and wait for its reply, passing over everything else; a busy sensor is asked twice.
+        """Send a command and wait for its reply, skipping everything else; a busy sensor is asked twice.
 
         Raises:
             DeviceTimeoutError: no answer.
@@ -119,7 +119,7 @@ class ScipSession:
         return reply
 
     async def demand(self, command: str) -> Reply:
-        """Like :meth:`ask`, but refuse any status that is not a success.
+        """Like :meth:`ask`, but reject any status other than success.
 
         Raises:
             DeviceFaultError: the sensor reports a fault.
@@ -134,12 +134,12 @@ class ScipSession:
         return reply
 
     async def handshake(self) -> Sensor:
-        """Bring the sensor to rest from any state and learn who it is.
+        """Bring the sensor to rest from any state and identify it.
 
         Raises:
             WrongDeviceError: another device, or another unit than configured.
             DeviceTimeoutError: silence.
-            ProtocolError: answers against the protocol.
+            ProtocolError: the sensor violates its protocol.
         """
         self._dialect = await self._wake()
         await self._drain()
@@ -155,7 +155,7 @@ class ScipSession:
         return sensor
 
     async def compare_clocks(self) -> Anchor | None:
-        """Read the sensor's counter in time-adjust mode; the quickest of several exchanges counts.
+        """Read the sensor's counter in time-adjust mode; the fastest of several exchanges is used.
 
         Returns:
             None if the sensor refuses that mode.
@@ -178,13 +178,13 @@ class ScipSession:
         return min(anchors, key=lambda anchor: anchor.round_trip, default=None)
 
     async def stop(self) -> None:
-        """Laser off, stream ended; waits briefly for the answer and never fails."""
+        """Switch the laser off and end the stream; waits briefly for the answer and never fails."""
         with contextlib.suppress(DeviceError, TimeoutError):
             async with self._clock.deadline(0.3):
                 await self._exchange("QT" if self._dialect is Dialect.SCIP2 else "L0")
 
     async def reset(self) -> None:
-        """RS: everything back to default; never fails."""
+        """Send RS: restore all defaults; never fails."""
         with contextlib.suppress(DeviceError):
             await self._ask_once("RS")
 
@@ -216,11 +216,11 @@ class ScipSession:
             raise DeviceTimeoutError(f"{self._link.name}: no answer to {command}") from error
 
     async def _wake(self) -> Dialect:
-        """End whatever the sensor is doing; it is idle afterwards."""
-        await self._discard(0.05)  # seconds whose bytes are thrown away after opening
-        for _ in range(4):  # one QT completes a half line, three may stay unanswered
+        """End any activity of the sensor; it is idle afterwards."""
+        await self._discard(0.05)  # seconds after opening whose bytes are discarded
+        for _ in range(4):  # one QT completes an incomplete line, three may remain unanswered
             try:
-                wake_timeout = 0.5  # seconds for the answer to one QT while anything may still be streaming
+                wake_timeout = 0.5  # timeout for the answer to one QT while the sensor may still stream (s)
                 async with self._clock.deadline(wake_timeout):
                     reply = await self._exchange("QT")
             except TimeoutError:
@@ -234,7 +234,7 @@ class ScipSession:
                 return Dialect.SCIP2
             await self.ask("RS" if outcome is StatusMeaning.UPDATE_MODE else "TM2")
         if self._heard and not self.parser.replies:
-            raise WrongDeviceError(f"{self._link.name}: what answers does not speak SCIP")
+            raise WrongDeviceError(f"{self._link.name}: the connected device does not use SCIP")
         raise DeviceTimeoutError(f"{self._link.name}: no answer to QT")
 
     async def _discard(self, seconds: float) -> None:
@@ -247,10 +247,10 @@ class ScipSession:
         self._replies.clear()
 
     async def _drain(self) -> None:
-        """Throw away everything until silence.
+        """Discard everything until the line is silent.
 
         Raises:
-            ProtocolError: there is no silence.
+            ProtocolError: the line is never silent.
         """
         try:
             async with self._clock.deadline(2.0):
@@ -286,21 +286,21 @@ class ScipSession:
 
 
 class HokuyoDriver(ScannerDriver[ScipConfig]):
-    """Scanner that speaks SCIP."""
+    """Scanner that uses SCIP."""
 
     scans = 0
-    """Scans published since the daemon started."""
+    """Number of scans published since the daemon started."""
     dropped = 0
-    """Damaged scans since the daemon started."""
+    """Number of damaged scans since the daemon started."""
 
     async def run(self, ready: Ready) -> None:
         """One session: wake, identify, compare clocks, stream; the laser is off when it ends.
 
         Raises:
-            DeviceLostError: nothing plugged in, or unplugged.
-            DeviceTimeoutError: silence, no good scan for ``stale_periods``, or scans that arrive late for seconds.
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: silence, no valid scan for ``stale_periods``, or scans with a growing delay.
             WrongDeviceError: another device answers.
-            ProtocolError: too many damaged scans in a row, or answers against the protocol.
+            ProtocolError: too many damaged scans in a row, or a violation of the protocol.
             DeviceFaultError: the sensor reports a hardware fault; it was reset once.
         """
         async with await self._port.open() as link:
@@ -354,7 +354,7 @@ class HokuyoDriver(ScannerDriver[ScipConfig]):
                 raise ProtocolError(f"{self._port.name}: {bad} damaged scans in a row")
 
     async def _other_status(self, session: ScipSession, status: str, outcome: StatusMeaning, interval: float) -> float:
-        """React to a scan block without data; returns the seconds to wait for the next scan."""
+        """Handle a scan block without data; return the seconds to wait for the next scan."""
         if outcome is StatusMeaning.VERIFYING:
             self._report(Severity.WARNING, f"sensor verifies a suspected fault, status {status}", status=status)
             return self._config.verify_timeout
@@ -363,13 +363,13 @@ class HokuyoDriver(ScannerDriver[ScipConfig]):
             return self._config.first_scan_periods * interval
         if outcome is StatusMeaning.FAULT:
             await session.reset()
-            raise DeviceFaultError(f"{self._port.name}: sensor reports hardware trouble, status {status}")
+            raise DeviceFaultError(f"{self._port.name}: the sensor reports a hardware fault, status {status}")
         raise ProtocolError(f"{self._port.name}: status {status} within a stream of scans")
 
     # SCIP 1.1
 
     async def _poll(self, session: ScipSession, sensor: Sensor, ready: Ready) -> None:
-        """Units that know SCIP 1.1 only: ask for every scan; they send no time, so the time of arrival is used."""
+        """Units with SCIP 1.1 only: request every scan; they send no time, so the time of arrival is used."""
         config, geometry = self._config, sensor.parameters
         shape = (geometry.first_step, geometry.last_step, config.cluster)
         await session.demand("L1")
@@ -400,10 +400,10 @@ class HokuyoDriver(ScannerDriver[ScipConfig]):
         try:
             return await session.next_reply(max(left, 0.0))
         except DeviceTimeoutError as error:
-            raise DeviceTimeoutError(f"{self._port.name}: no good scan in time") from error
+            raise DeviceTimeoutError(f"{self._port.name}: no valid scan in time") from error
 
     def _decode(self, reply: Reply, shape: tuple[int, int, int], bad: int) -> ScanBlock | None:
-        """The scan, or None if it is damaged; reported unless ``bad`` others came just before."""
+        """Parse the scan; None if it is damaged, which is reported unless ``bad`` others preceded it."""
         try:
             return decode_scan(reply, *shape)
         except ProtocolError as error:
@@ -415,12 +415,12 @@ class HokuyoDriver(ScannerDriver[ScipConfig]):
     def _publish(self, block: ScanBlock, step_0: int, geometry: Parameters, received: int) -> None:
         """Send one scan, its stamp moved from step 0 to the first beam."""
         config = self._config
-        # A cluster's range is the least of its steps: it stands for their middle.
+        # A cluster's range is the minimum of its steps: it represents their middle.
         first = geometry.first_step + (config.cluster - 1) / 2
         last = first + (len(block.values) - 1) * config.cluster
         ranges, codes = split(block.values, geometry, config)
         longest = geometry.greatest_mm / 1000
-        greatest_2char = 4.095  # greatest range in two characters, m
+        greatest_2char = 4.095  # maximum range in two characters, m
         self._out.put(
             LaserScan(
                 stamp=step_0 + round(first * geometry.step_time * SECOND),

@@ -1,8 +1,8 @@
 """Device side of a URG-04LX, byte for byte: power-up state, both dialects, streaming, time, faults.
 
-Three tasks run forever: one reads request lines, one answers them a little later, and one is the rotor,
-which turns on a 100 ms grid of the sensor's clock with or without a client. A requested stream continues
-until QT, RS, its count or the supply ends it; a host that dies changes nothing.
+Three tasks run forever: one reads request lines, one answers them a little later, and one is the rotor, which turns on
+a 100 ms grid of the sensor's clock with or without a client. A requested stream continues until QT, RS, its count or
+the supply ends it; a dying host changes nothing.
 
 Where the specification is silent the emulator answers TM0 during a scan with 0A, MD during a stream with 0B,
 and everything but TM and RS in time-adjust mode with 0E.
@@ -48,7 +48,7 @@ class ScanOrder:
     cluster: int = 1
     skip: int = 0
     left: int | None = None
-    """Scans still to send; None = endless."""
+    """Number of scans still to send; None: endless."""
     prefix: str = ""
     """Request without remaining count and tag."""
     tag: str = ""
@@ -60,7 +60,7 @@ class ScanOrder:
 
 
 def parse_order(text: str, tag: str = "", greatest: int = URG_04LX.greatest_step) -> ScanOrder | str:
-    """Parse a request for scans (MD, GS ...) of steps up to ``greatest``; a refusal is its two-character status."""
+    """Parse a request for scans (MD, GS ...) of steps up to ``greatest``; a rejection is its two-character status."""
     command, digits = text[:2], text[2:]
     multi = command[0] == "M"
     wanted = 13 if multi else 10
@@ -79,7 +79,7 @@ def parse_order(text: str, tag: str = "", greatest: int = URG_04LX.greatest_step
 
 
 def parse_scip1_order(text: str) -> ScanOrder | None:
-    """Parse G of SCIP 1.1; None if it is refused."""
+    """Parse G of SCIP 1.1; None if it is rejected."""
     digits = text[1:]
     if text[:1] != "G" or len(digits) != 8 or not digits.isdigit():
         return None
@@ -106,8 +106,8 @@ def scan_lines(order: ScanOrder, counter: int, revolution: NDArray[np.int32]) ->
 
 
 def _strength(values: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Intensities of the returns of ranges, mm: of a near white surface, falling with the distance."""
-    bright = 4000  # intensity of a near white surface; it falls with the distance
+    """Intensities of the returns for ranges (mm): decreasing with the distance."""
+    bright = 4000  # intensity of a near white surface; it decreases with the distance
     fading = 6000  # distance that halves the intensity, mm
     return np.rint(bright / (1.0 + (np.maximum(values, 0) / fading) ** 2)).astype(np.int32)
 
@@ -222,7 +222,7 @@ class HokuyoEmulator(FaultyDevice):
             },
         )
         self._elapsed = 0
-        """Sensor's own time at ``_born``, ns."""
+        """Sensor's time at ``_born``, ns."""
         self._covers: list[tuple[slice, Cover]] = []
         self._order: ScanOrder | None = None
         self._statuses: deque[int] = deque()
@@ -246,7 +246,7 @@ class HokuyoEmulator(FaultyDevice):
             tasks.create_task(self._turn(end), name=f"{self.name} turns")
 
     def power_cycle(self) -> None:
-        """Off and on: back in SCIP 1.1 unless configured to start in 2.0, counter at zero, hearing again."""
+        """Switch off and on: SCIP 1.1 unless configured to start in 2.0, counter at zero, accepting requests again."""
         self._power_up()
         self._scip2 = self._state == "scip2"
 
@@ -342,16 +342,16 @@ class HokuyoEmulator(FaultyDevice):
                 self._send_scan(end, order, begin)
 
     async def _next_revolution(self, previous: int | None) -> int | None:
-        """Sensor time at step 0 of the revolution after ``previous``; None if the rotor never turns again."""
+        """Sensor time at step 0 of the revolution after ``previous``; None if the rotor has stopped for good."""
         period = self._model.period
         if previous is None:
             return -(-self._time() // period) * period
         late = (self._time() - previous) // period
-        catch_up = 5  # revolutions sent late after the host's machine slept; older ones are lost
+        catch_up = 5  # number of revolutions sent late after the host's machine slept; older ones are lost
         return previous + period * (1 if late <= catch_up else late)
 
     def _latest_revolution(self) -> int:
-        """Sensor's time at step 0 of the last revolution that is complete."""
+        """Sensor time at step 0 of the last complete revolution."""
         period = self._model.period
         return (self._time() - self._sweep()) // period * period
 
@@ -532,7 +532,7 @@ class HokuyoEmulator(FaultyDevice):
         return self._qt(text, tag)
 
     def _cr(self, text: str, _tag: str) -> tuple[str, list[bytes]]:
-        """Its rotor has one speed, the default."""
+        """Its rotor has only one speed, the default."""
         return ("03" if text == "CR00" else "04"), []
 
     def _tm(self, text: str, _tag: str) -> tuple[str, list[bytes]]:

@@ -90,7 +90,7 @@ def decode_array(payload: bytes, width: int) -> NDArray[np.int32]:
         ProtocolError: a character outside ``0`` to ``o``, or a number cut short.
     """
     if len(payload) % width:
-        raise ProtocolError(f"SCIP: {len(payload)} characters are no whole number of {width}-character ranges")
+        raise ProtocolError(f"SCIP: {len(payload)} characters are not a whole number of {width}-character ranges")
     digits = np.frombuffer(payload, np.uint8) - np.uint8(0x30)  # too small a byte wraps to a great one
     if digits.size and digits.max() > 0x3F:
         raise ProtocolError("SCIP: byte outside the encoding in a data line")
@@ -137,7 +137,7 @@ def request(command: str, tag: str = "") -> bytes:
         raise ValueError(f"tag {tag!r} is longer than {TAG_LIMIT} characters")
     text = f"{command};{tag}" if tag else command
     if not text.isascii() or not text.isprintable() or ";" in command or not command:
-        raise ValueError(f"{text!r} is no SCIP request")
+        raise ValueError(f"{text!r} is not a SCIP request")
     return text.encode("ascii") + b"\n"
 
 
@@ -358,13 +358,13 @@ def decode_scan(reply: Reply, start: int, end: int, cluster: int = 1) -> ScanBlo
     """
     name = reply.echo[:1] if reply.scip1 else reply.echo[:2]
     if name not in RANGE_WIDTH or (not reply.scip1 and len(reply.lines) < 2):
-        raise ProtocolError(f"SCIP: {reply.echo!r} carries no scan")
+        raise ProtocolError(f"SCIP: {reply.echo!r} contains no scan")
     counter = None if reply.scip1 else decode_counter(reply.lines[0])
     payload = unwrap_lines(reply.lines if reply.scip1 else reply.lines[1:], sums=not reply.scip1)
     values = decode_array(payload, RANGE_WIDTH[name])
     steps, width = end - start + 1, max(cluster, 1)
     if len(values) not in (steps // width, -(-steps // width)):
-        raise ProtocolError(f"SCIP: {len(values)} ranges came, {-(-steps // width)} were asked for")
+        raise ProtocolError(f"SCIP: {len(values)} ranges received, {-(-steps // width)} requested")
     return ScanBlock(counter, values)
 
 

@@ -53,7 +53,7 @@ class RecordedRanges:
                 times.append(time)
                 rows.append(row)
         if not rows:
-            raise InputError(f"{path}: holds no scans")
+            raise InputError(f"{path}: contains no scans")
         return cls((np.array(times, np.int64) - times[0]) * 1000, np.array(rows, np.int32))
 
     def start(self, time_ns: int) -> None:

@@ -49,5 +49,5 @@ class HostHealthConfig(Schema):
         pairs = (("hot_clear", "hot"), ("busy_clear", "busy"), ("memory", "memory_clear"), ("disk", "disk_clear"))
         for lower, upper in pairs:
             if not getattr(self, lower) < getattr(self, upper):
-                raise ValueError(f"{lower} {getattr(self, lower)} < {upper} {getattr(self, upper)} does not hold")
+                raise ValueError(f"expected {lower} {getattr(self, lower)} < {upper} {getattr(self, upper)}")
         return self

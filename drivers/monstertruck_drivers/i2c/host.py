@@ -42,7 +42,7 @@ class I2cBus:
         if answer.error in _NOT_ACKNOWLEDGED or (not answer.error and len(answer.data) != count):
             raise DeviceTimeoutError(f"{self.name}: no acknowledgement of address 0x{address:02x}")
         if answer.error == errno.ENODEV:
-            raise DeviceLostError(f"{self.name}: the bus is gone")
+            raise DeviceLostError(f"{self.name}: the bus was removed")
         if answer.error:
             raise DeviceTimeoutError(f"{self.name}: address 0x{address:02x}: {os.strerror(answer.error)}")
         return answer.data

@@ -110,7 +110,7 @@ class Ld19Driver(ScannerDriver[Ld19Config]):
 
     def _stale(self, port: str, packets: bool) -> Exception:
         if packets:
-            return DeviceTimeoutError(f"{port}: packets, but no whole revolution: its head does not turn")
+            return DeviceTimeoutError(f"{port}: packets, but no complete revolution: its head does not turn")
         return ProtocolError(f"{port}: bytes, but no packet of an LD19")
 
 

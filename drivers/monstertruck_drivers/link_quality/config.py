@@ -35,5 +35,5 @@ class LinkQualityConfig(Schema):
     def _limits_in_order(self) -> Self:
         for lower, upper in pairwise(("poor", "fair", "good", "excellent")):
             if not getattr(self, lower) < getattr(self, upper):
-                raise ValueError(f"{lower} {getattr(self, lower)} < {upper} {getattr(self, upper)} does not hold")
+                raise ValueError(f"expected {lower} {getattr(self, lower)} < {upper} {getattr(self, upper)}")
         return self

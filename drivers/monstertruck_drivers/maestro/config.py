@@ -74,7 +74,7 @@ class BatteryInputConfig(PackConfig):
         # A broken divider reads 0 or full scale.
         for raw in (0, ADC_MAX):
             if self.plausible_min <= self.volts(raw) <= self.plausible_max:
-                raise ValueError(f"reading {raw} means {self.volts(raw):.1f} V, which may not count as plausible")
+                raise ValueError(f"reading {raw} means {self.volts(raw):.1f} V, which is not plausible")
         return self
 
     def volts(self, raw: int) -> float:
@@ -140,5 +140,5 @@ class MaestroConfig(Schema):
         if self.deadman_channel is not None:
             used["deadman_channel"] = self.deadman_channel
         if len(set(used.values())) < len(used):
-            raise ValueError(f"every channel may have one use only, got {used}")
+            raise ValueError(f"every channel may have only one use, got {used}")
         return self

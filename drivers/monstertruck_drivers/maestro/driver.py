@@ -134,7 +134,7 @@ class MaestroDriver:
         if self._fresh is not None and not self._is_fresh(self._fresh):
             self._fresh = None
             session.send(*self._line(session, high=False), *self._more(session, rest=True))
-            text = f"no steering command for {self._config.command_timeout} s: servos hold"
+            text = f"no steering command for {self._config.command_timeout} s: servos keep their position"
             self._events(Reason.TICK_STALLED, Severity.WARNING, self.name, text)
 
     def _targets(self, session: MaestroSession, command: SteeringCommand) -> list[bytes]:
@@ -201,7 +201,7 @@ class MaestroDriver:
         if lost:
             if not self._failing:
                 what = ", ".join(error_names(errors)) or (
-                    "pulses beyond min_us and max_us" if strange else "pulses off"
+                    "pulses outside min_us to max_us" if strange else "pulses off"
                 )
                 text = f"the servo controller reports {what}: settings and targets sent again"
                 self._events(Reason.DEVICE_FAULT, Severity.WARNING, self.name, text, error_word=errors)

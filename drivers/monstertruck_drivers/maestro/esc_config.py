@@ -60,7 +60,7 @@ class MaestroEscConfig(Schema):
         used = {servo.channel for servo in unit.servos} | {unit.deadman_channel}
         used |= {None if unit.battery is None else unit.battery.channel}
         if self.esc.channel in used:
-            raise ValueError(f"esc.channel {self.esc.channel}: the unit uses it for something else")
+            raise ValueError(f"esc.channel {self.esc.channel}: another function of the unit uses this channel")
         if unit.device_number is not None or unit.use_crc:
-            raise ValueError("unit: expected the compact protocol without CRC, which the stop script speaks")
+            raise ValueError("unit: expected the compact protocol without CRC, which the stop script uses")
         return self

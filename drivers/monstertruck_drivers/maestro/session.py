@@ -72,7 +72,7 @@ class MaestroSession:
             if not await self._speaks():
                 self._in_step = True
                 return
-        raise DeviceTimeoutError(f"{self._link.name}: answers stay out of step")
+        raise DeviceTimeoutError(f"{self._link.name}: answers remain out of step with requests")
 
     async def identify(self, *channels: int) -> int:
         """Make sure that a Maestro answers, reading its errors and the positions of ``channels``.
@@ -104,10 +104,11 @@ class MaestroSession:
             heard = True
         name = self._link.name
         if heard:
-            raise WrongDeviceError(f"{name}: no Maestro: it speaks unasked or answers out of form")
+            raise WrongDeviceError(f"{name}: not a Maestro: it sends without being asked, or malformed answers")
         raise DeviceTimeoutError(
-            f"{name}: silence; expected a Maestro's Command Port (USB interface 00) in serial mode 'USB Dual Port' "
-            "(factory mode is UART: set it once with the maker's tool), with matching CRC setting and device number"
+            f"{name}: silent; expected a Maestro's Command Port (USB interface 00) in serial mode 'USB "
+            "Dual Port' (factory default is UART: set it once with the manufacturer's tool), with "
+            "matching CRC setting and device number"
         )
 
     async def _speaks(self) -> bool:
@@ -126,7 +127,7 @@ class MaestroSession:
             ProtocolError: malformed, as after a lost byte.
         """
         if errors > ERROR_MASK or any(position > POSITION_MAX for position in positions):
-            raise ProtocolError(f"{self._link.name}: answers out of form: errors {errors:#x}, positions {positions}")
+            raise ProtocolError(f"{self._link.name}: malformed answers: errors {errors:#x}, positions {positions}")
 
     def require_link(self) -> None:
         """Notice an unplugged device without sending anything.

@@ -37,7 +37,7 @@ class MjpegConfig(Schema):
     @model_validator(mode="after")
     def _polls_by_http(self) -> Self:
         if self.poll is not None and self.http is None:
-            raise ValueError("poll: only an HTTP server is polled; set http to the path of its picture")
+            raise ValueError("poll: only an HTTP server is polled; set http to the path of its image")
         return self
 
     @property

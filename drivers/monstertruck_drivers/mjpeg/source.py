@@ -60,7 +60,7 @@ class LinkSource:
                 await stream.begin()
         except TimeoutError:
             stream.close()
-            raise DeviceTimeoutError(f"{self.name}: no picture for {self._config.watchdog} s") from None
+            raise DeviceTimeoutError(f"{self.name}: no image for {self._config.watchdog} s") from None
         except BaseException:
             stream.close()
             raise
@@ -77,7 +77,9 @@ class LinkSource:
             while HEAD_END not in answer:
                 answer += await link.read()
                 if len(answer) > HEAD_MOST + HEAD_MOST and HEAD_END not in answer:
-                    raise ProtocolError(f"{self.name}: no end of the answer's head in {len(answer)} bytes")
+                    raise ProtocolError(
+                        f"{self.name}: the header of the answer does not end within {len(answer)} bytes"
+                    )
             head, _, rest = answer.partition(HEAD_END)
             return _Connection(self.name, link, self._checked(head), rest)
         except BaseException:
@@ -88,11 +90,11 @@ class LinkSource:
         try:
             found = HttpHead.of(head)
         except ValueError as error:
-            raise ProtocolError(f"{self.name}: no HTTP server: the answer {error}") from None
+            raise ProtocolError(f"{self.name}: not an HTTP server: the answer {error}") from None
         if found.status != OK:
             raise DeviceMismatchError(f"{self.name}: the server answers {found.status} {found.reason}".rstrip())
         if found.kind not in KINDS:
-            raise WrongDeviceError(f"{self.name}: the server gives {found.kind or 'no content type'}, not pictures")
+            raise WrongDeviceError(f"{self.name}: the server sends {found.kind or 'no content type'}, not images")
         return found
 
     def frame(self, number: int, data: bytes) -> CameraFrame:

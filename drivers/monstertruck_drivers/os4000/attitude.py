@@ -76,7 +76,7 @@ _NO_IRON: Final = IronConfig()
 
 def _heading(sentence: Sentence, iron: IronConfig) -> float:
     if sentence.field is None or sentence.pitch is None or sentence.roll is None:
-        raise ValueError("the field is missing, which the calibrated heading needs")
+        raise ValueError("the magnetic field is missing, which the calibrated heading needs")
     x, y, z = (component * MILLIGAUSS for component in sentence.field)
     north, left = level_field((x, y, z), -math.radians(sentence.pitch), math.radians(sentence.roll), iron)
     return math.atan2(left, north) % (2 * math.pi)

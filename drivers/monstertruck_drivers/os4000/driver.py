@@ -102,13 +102,13 @@ class Os4000Driver:
         wrong: dict[Key, tuple[int, str]] = {}
         fields = observed_fields(heard)
         if fields != config.fields:
-            text = f"the unit sends {_names(fields)}, configured is {_names(Fields(config.fields))}"
+            text = f"the compass sends {_names(fields)}, expected {_names(Fields(config.fields))}"
             wrong[Key.FIELDS] = config.fields, text
         rate = observed_rate(heard)
         rate_tolerance = 0.25  # tolerance of the observed rate, as a fraction of the configured rate
         if rate is None or abs(rate / config.rate - 1) > rate_tolerance:
-            seen = "too seldom" if rate is None else f"{rate:.1f} times a second"
-            wrong[Key.RATE] = config.rate, f"the unit sends {seen}, configured is {config.rate}"
+            seen = "too rarely" if rate is None else f"{rate:.1f} times a second"
+            wrong[Key.RATE] = config.rate, f"the compass sends {seen}, expected {config.rate}"
         return wrong
 
     async def _serve(self, session: Os4000Session) -> None:
@@ -139,7 +139,7 @@ class Os4000Driver:
                 attitude = to_attitude(sentence, self._config, stamp, received, self._out.next_seq())
             except ValueError as error:
                 if not self._refusing:
-                    self._events(Reason.DEVICE_PROTOCOL, Severity.WARNING, self.name, f"sentence refused: {error}")
+                    self._events(Reason.DEVICE_PROTOCOL, Severity.WARNING, self.name, f"sentence rejected: {error}")
                 self._refusing = True
                 continue
             self._refusing = False

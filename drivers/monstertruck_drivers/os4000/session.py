@@ -86,8 +86,8 @@ class Os4000Session:
                 f"than the unit's ({', '.join(map(str, protocol.BAUDS))}; {protocol.FACTORY_BAUD} from the factory)"
             )
         raise DeviceTimeoutError(
-            f"{name}: silence; expected an OS4000 that streams, at its baud rate "
-            f"({protocol.FACTORY_BAUD} from the factory)"
+            f"{name}: silent; expected an OS4000 that streams at its baud rate (factory default "
+            f"{protocol.FACTORY_BAUD})"
         )
 
     async def set(self, command: Key, number: int) -> None:

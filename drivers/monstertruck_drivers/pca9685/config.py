@@ -126,7 +126,7 @@ class Pca9685EscConfig(Schema):
     @model_validator(mode="after")
     def _channels_differ(self) -> Self:
         if self.esc.channel in (servo.channel for servo in self.unit.servos):
-            raise ValueError(f"esc.channel {self.esc.channel}: a servo has this channel")
+            raise ValueError(f"esc.channel {self.esc.channel}: a servo uses this channel")
         if self.unit.counts(self.esc.neutral_us + self.esc.reach_us) >= COUNTS:
             raise ValueError(f"unit.frequency {self.unit.frequency:g}: the longest pulse of esc is longer than a cycle")
         return self

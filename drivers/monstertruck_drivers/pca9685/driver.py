@@ -109,7 +109,7 @@ class Pca9685Driver:
         if self._command is None or self._stale or self._is_fresh(self._command):
             return
         self._stale = True
-        text = f"no steering command for {self._config.command_timeout} s: servos hold"
+        text = f"no steering command for {self._config.command_timeout} s: servos keep their position"
         self._events(Reason.TICK_STALLED, Severity.WARNING, self.name, text)
         with self._misses:
             await self._write(session, self._more(rest=True))
@@ -161,7 +161,7 @@ class Pca9685Driver:
                 await self._require_rest(session, differ)
             else:
                 what = f"channels {differ} differ" if set_up else "mode or frequency lost"
-                text = f"the PCA9685 reads back otherwise ({what}): settings and pulses sent again"
+                text = f"the PCA9685's registers are wrong ({what}): settings and pulses sent again"
                 self._events(Reason.DEVICE_FAULT, Severity.WARNING, self.name, text)
             await session.set_up(config.prescale)
             await self._write(session, dict(self._sent) | self._more(rest=self._command is None or self._stale))

@@ -77,7 +77,7 @@ class Pca9685Session:
         found = bytes([await self.read(PwmRegister.SUBADR1 + i) for i in range(len(OWN_ADDRESSES))])
         if found != OWN_ADDRESSES:
             raise WrongDeviceError(
-                f"{self.name}: no PCA9685: registers 2 to 5 are {found.hex(' ')}, expected {OWN_ADDRESSES.hex(' ')}"
+                f"{self.name}: not a PCA9685: registers 2 to 5 are {found.hex(' ')}, expected {OWN_ADDRESSES.hex(' ')}"
             )
         return PwmMode1(await self.read(PwmRegister.MODE1)), await self.read(PwmRegister.PRE_SCALE)
 

@@ -38,7 +38,7 @@ class ReceiverConfig(Schema):
     def _each_once(self) -> Self:
         used = [self.speed, self.steer, self.arm, *(c for c in (self.drive, self.estop, self.unseen) if c is not None)]
         if len(set(used)) < len(used):
-            raise ValueError(f"every channel may have one use only, got {used}")
+            raise ValueError(f"every channel may have only one use, got {used}")
         return self
 
 

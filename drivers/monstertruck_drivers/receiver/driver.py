@@ -170,7 +170,7 @@ class ReceiverDriver:
             reason, severity = (
                 (Reason.DEVICE_LOST, Severity.WARNING) if controls.lost else (Reason.DEVICE_READY, Severity.INFO)
             )
-            text = "the radio control is lost" if controls.lost else "the radio control is there"
+            text = "the radio control is lost" if controls.lost else "the radio control is connected"
             self._events(reason, severity, self.name, text, link_quality=controls.link_quality, rssi=controls.rssi)
             self._said = controls.lost
         return controls
@@ -180,7 +180,7 @@ async def first_frames(stream: DeviceStream[ReceiverFrame], config: ReceiverConf
     """Wait for the first frames of a session; raises as ``DeviceStream.first``."""
     # Seconds to receive a frame at the start; a receiver without its transmitter sends link statistics only.
     listen = 1.0
-    hint = "another protocol or baud rate" if isinstance(config, CrsfConfig) else "is the line inverted back?"
+    hint = "another protocol or baud rate" if isinstance(config, CrsfConfig) else "is the signal inverted?"
     return await stream.first(listen, f"of a receiver: {hint}")
 
 

@@ -83,7 +83,10 @@ class RoboclawDriver:
         """
         steps = [step(old, new) for old, new in zip(before, now, strict=True)]
         if max(map(abs, steps)) * self._config.count > self._config.max_rate * dt:
-            text = f"{self._port.name}: counters jumped by {steps[0]} and {steps[1]}: the unit restarted its count"
+            text = (
+                f"{self._port.name}: counters jumped by {steps[0]} and {steps[1]}: the controller restarted "
+                "its counters"
+            )
             self._events(Reason.DEVICE_RESTARTED, Severity.WARNING, self.name, text)
             raise DeviceRestartedError(text)
         self._turned = [turned + by for turned, by in zip(self._turned, steps, strict=True)]

@@ -50,7 +50,7 @@ class RoboclawSession:
             # A host that died may have left half a request, which is dropped after a pause.
             await self._clock.sleep(2 * PACKET_GAP)
         if not heard:
-            raise DeviceTimeoutError(f"{self._link.name}: silence; expected a RoboClaw at address {self._address}")
+            raise DeviceTimeoutError(f"{self._link.name}: silent; expected a RoboClaw at address {self._address}")
         raise WrongDeviceError(f"{self._link.name}: {heard.hex(' ')} is not the answer of a RoboClaw")
 
     async def counts(self) -> tuple[int, int]:

@@ -30,7 +30,7 @@ from monstertruck_runtime.ports import Ready
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 
-STANDS: Final = ": its motor does not turn (an A1's turns with port.dtr false)"
+STANDS: Final = ": its motor does not turn (an A1 needs port.dtr false)"
 
 
 class SampleDecoder:
@@ -162,8 +162,8 @@ class RplidarDriver(ScannerDriver[RplidarConfig]):
                     publish(turn, begin, stream.arrival, sheet, config, self._out, self.name)
             if clock.now() >= due:
                 if measured:
-                    raise DeviceTimeoutError(f"{self._port.name}: samples, but no whole revolution")
-                raise ProtocolError(f"{self._port.name}: bytes, but no sample of a RPLIDAR")
+                    raise DeviceTimeoutError(f"{self._port.name}: samples, but no complete revolution")
+                raise ProtocolError(f"{self._port.name}: bytes, but no sample of an RPLIDAR")
 
     def _report_ready(self, unit: ScannerUnit, mode: ScanMode) -> None:
         identity = unit.identity

@@ -80,7 +80,7 @@ class RplidarSession:
             await self.reset()
             health = await self._health()
             if health.status == protected:
-                raise DeviceFaultError(f"{self._link.name}: unit protects itself, code 0x{health.code:04x}")
+                raise DeviceFaultError(f"{self._link.name}: protection stop of the unit, code 0x{health.code:04x}")
         lists_modes_from = (1, 24)  # first firmware that lists its modes (maker's protocol, GET_LIDAR_CONF)
         lists = identity.firmware >= lists_modes_from
         modes, typical = await self._listed_modes() if lists else await self._early_modes()
@@ -113,7 +113,7 @@ class RplidarSession:
                     await self._link.read(QUIET)
                 except TimeoutError:
                     return
-        raise WrongDeviceError(f"{self._link.name}: keeps sending after STOP: no RPLIDAR, or another baud rate")
+        raise WrongDeviceError(f"{self._link.name}: continues to send after STOP: not an RPLIDAR, or another baud rate")
 
     async def reset(self) -> None:
         """Restart it, and wait until it answers again."""
@@ -145,7 +145,9 @@ class RplidarSession:
             except DeviceTimeoutError:
                 continue
         if self._heard:
-            raise WrongDeviceError(f"{self._link.name}: what answers is no RPLIDAR, or has another baud rate")
+            raise WrongDeviceError(
+                f"{self._link.name}: the connected device is not an RPLIDAR, or has another baud rate"
+            )
         raise DeviceTimeoutError(f"{self._link.name}: no answer")
 
     async def _health(self) -> Health:
@@ -163,7 +165,7 @@ class RplidarSession:
             if answer in SIZES and time:
                 modes.append(ScanMode(number, name, time / 256e6, far / 256, DataType(answer)))
         if not modes:
-            raise ProtocolError(f"{self._link.name}: lists no mode that this driver can read")
+            raise ProtocolError(f"{self._link.name}: has no scan mode that this driver can read")
         return tuple(modes), typical
 
     async def _early_modes(self) -> tuple[tuple[ScanMode, ...], int]:
@@ -186,7 +188,7 @@ class RplidarSession:
     async def _property(self, key: ConfigKey, mode: int = 0) -> bytes:
         data = await self._ask(config_request(key, mode), DataType.CONFIG)
         if len(data) < 5 or struct.unpack_from("<I", data)[0] != key:  # key and at least one byte
-            raise ProtocolError(f"{self._link.name}: answered another property than {key.name}")
+            raise ProtocolError(f"{self._link.name}: answered with a property other than {key.name}")
         return data[4:] + bytes(4)
 
     async def _ask(self, asked: bytes, kind: DataType) -> bytes:

@@ -42,7 +42,7 @@ class ClockWatch:
         if mapping.slews > slews and arrival >= self._slew_due:
             slew_period = 60.0  # minimum interval between reports of clocks that run apart (s)
             self._slew_due = arrival + round(slew_period * SECOND)
-            text = f"the sensor's clock and the computer's run apart by {mapping.drift:.1%}: followed"
+            text = f"the clocks of sensor and computer drift apart by {mapping.drift:.1%}: compensated"
             self._events(Reason.CLOCK_DRIFT, Severity.WARNING, self._source, text)
         self._check_age(mapping, arrival, port)
         return stamp
@@ -58,5 +58,5 @@ class ClockWatch:
         elif arrival - self._late_since > late_for * SECOND:
             self._late_since = None
             raise DeviceTimeoutError(
-                f"{port}: scans arrive {mapping.late / SECOND:.1f} s later than at the start: the session restarts"
+                f"{port}: scan latency grew by {mapping.late / SECOND:.1f} s since the start: the session restarts"
             )

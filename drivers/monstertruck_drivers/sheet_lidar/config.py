@@ -66,7 +66,7 @@ class SheetLidarConfig(ReturnsConfig):
     def _ranges_in_order(self) -> Self:
         if not self.range_min < (self.range_dark or self.range_max) <= self.range_max:
             raise ValueError(
-                f"range_min {self.range_min:g} m, range_dark {self.range_dark} m, range_max {self.range_max:g} m: "
-                "expected them to rise"
+                f"range_min {self.range_min:g} m, range_dark {self.range_dark} m, range_max "
+                f"{self.range_max:g} m: expected increasing values"
             )
         return self

@@ -83,5 +83,7 @@ class Srf08Config(Schema):
             raise ValueError(f"range_min {self.range_min} m: expected less than range_max {self.range_max} m")
         slot, ranging = 1 / self.rate / len(self.groups), 2 * self.range_max / self.speed_of_sound
         if slot < ranging + 0.015:
-            raise ValueError(f"rate {self.rate}: a group needs {ranging + 0.015:.3f} s, it would have {slot:.3f} s")
+            raise ValueError(
+                f"rate {self.rate}: a group needs {ranging + 0.015:.3f} s, but only {slot:.3f} s are available"
+            )
         return self

@@ -118,7 +118,7 @@ class Srf08Driver:
             self._lost(name, "does not answer")
             return SonarEcho(name=name, answered=False, stamp=asked)
         if self._is_stuck(name, reading.microseconds):
-            self._lost(name, f"says {reading.microseconds} us again and again")
+            self._lost(name, f"repeats {reading.microseconds} us")
             return SonarEcho(name=name, answered=False, stamp=at)
         self._returned(name)
         distance = reading.microseconds * 1e-6 * self._config.speed_of_sound / 2

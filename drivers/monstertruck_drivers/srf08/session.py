@@ -29,7 +29,7 @@ class Srf08Session:
             ProtocolError: unrequested bytes.
         """
         if count := self._link.discard():
-            raise ProtocolError(f"{self._link.name}: {count} bytes too many: answers are out of step")
+            raise ProtocolError(f"{self._link.name}: {count} unexpected bytes: answers are out of step with requests")
         self._link.write(command)
         try:
             return await self._link.exactly(size, self._timeout)

@@ -106,8 +106,8 @@ class StepperDriver(MotorBoard[StepperConfig, StepperSession]):
         identity = await session.identify()
         if identity.motors < config.motors or identity.steps_per_turn != config.steps_per_turn:
             raise DeviceMismatchError(
-                f"{self._port.name}: {identity.motors} motors of {identity.steps_per_turn} steps, configured are "
-                f"{config.motors} of {config.steps_per_turn}"
+                f"{self._port.name}: {identity.motors} motors with {identity.steps_per_turn} steps, "
+                f"expected {config.motors} with {config.steps_per_turn}"
             )
         if self._last is not None and len(self._last[0].positions) != identity.motors:
             self._last = None  # another controller is plugged in
@@ -119,7 +119,7 @@ class StepperDriver(MotorBoard[StepperConfig, StepperSession]):
         settings = (config.acceleration, config.quick_deceleration, round(1000 * config.watchdog))
         taken = await session.ask("C", *settings, attempts=ASK_ATTEMPTS)
         if taken.words != tuple(map(str, settings)):
-            raise ProtocolError(f"{self._port.name}: settings {settings} were taken as {' '.join(taken.words)}")
+            raise ProtocolError(f"{self._port.name}: settings {settings} were applied as {' '.join(taken.words)}")
         text = f"{identity.name} version {identity.version}, {identity.motors} motors"
         self._events(Reason.DEVICE_READY, Severity.INFO, self.name, text)
         self._motors = identity.motors
@@ -165,7 +165,7 @@ class StepperDriver(MotorBoard[StepperConfig, StepperSession]):
         if self._clock.now() - self._noted > noise_window:
             self._noise, self._noted = splitter.bad, self._clock.now()
         elif splitter.bad - self._noise >= 5:  # damaged lines within ``noise_window`` that are reported
-            text = f"{splitter.bad - self._noise} damaged lines, newest {splitter.strange!r}"
+            text = f"{splitter.bad - self._noise} damaged lines, latest {splitter.strange!r}"
             self._events(Reason.DEVICE_PROTOCOL, Severity.WARNING, self.name, text)
             self._noise = splitter.bad
 

@@ -114,7 +114,7 @@ def decode(line: bytes) -> Line:
     text = line.removesuffix(_END)
     body, star, check = text[1:].rpartition(b"*")
     if not text.startswith(_START) or not star or len(text) >= MAX_LINE:
-        raise LineError(f"{line[:40]!r}: no line of this protocol")
+        raise LineError(f"{line[:40]!r}: not a line of this protocol")
     if check != b"%04X" % crc(body):
         raise LineError(f"{line[:40]!r}: check is {check!r}, expected {crc(body):04X}")
     if not body.isascii() or not body.decode().isprintable():

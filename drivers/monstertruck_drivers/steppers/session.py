@@ -102,13 +102,13 @@ class StepperSession:
             identity = Identity.of(await self.ask("I", attempts=ASK_ATTEMPTS))
         except (DeviceTimeoutError, ProtocolError, LineError) as error:
             if self.splitter.bad and not self.heard:
-                text = f"{self._link.name}: no {NAME}, sends {self.splitter.strange!r}"
+                text = f"{self._link.name}: not {NAME}, it sends {self.splitter.strange!r}"
                 raise WrongDeviceError(text) from error
             if isinstance(error, LineError):
                 raise ProtocolError(f"{self._link.name}: {error}") from error
             raise
         if identity.name != NAME:
-            raise WrongDeviceError(f"{self._link.name}: it calls itself {identity.name}, expected {NAME}")
+            raise WrongDeviceError(f"{self._link.name}: identifies itself as {identity.name}, expected {NAME}")
         return identity
 
     async def _answer(self, seq: int) -> Line | None:

@@ -86,7 +86,7 @@ class PowerConfig(Schema):
     @model_validator(mode="after")
     def _method_known(self) -> Self:
         if self.after is not None and self.method is None:
-            raise ValueError("after: ports can be cycled unasked only by a method")
+            raise ValueError("after: automatic power cycling of ports needs a method")
         if self.cut and self.method not in (CycleMethod.PORT, CycleMethod.UHUBCTL):
             raise ValueError("cut: expected method port or uhubctl, which switch a port's power")
         return self

@@ -318,7 +318,7 @@ class HubCoordinator:
 
     def _report_lost(self, hub: str, members: set[str]) -> None:
         devices = sorted((name for name in members if not self._is_hub(name)), key=sort_key)
-        what = "vanished" if hub in members else "is there, but all behind it vanished"
+        what = "vanished" if hub in members else "is present, but all devices behind it disappeared"
         self._events(
             Reason.HUB_LOST,
             Severity.WARNING,
@@ -351,7 +351,9 @@ class HubCoordinator:
             known = slot.device
             wanted = other in self._roles or other in self._outages
             if not slot.present and wanted and known is not None and _alike(known, device):
-                text = f"{self._describe(other)} seems to be at {place(name)} now: plug it back, or run find-port"
+                text = (
+                    f"{self._describe(other)} seems to be at {place(name)} now: plug it into its port, or run find-port"
+                )
                 self._events(Reason.PORT_MOVED, Severity.WARNING, NAME, text, configured=other, found=name)
 
     def _describe(self, name: str) -> str:
@@ -501,7 +503,7 @@ class UsbService:
 
     async def _keep_awake(self, node: UsbNode) -> None:
         if await keep_awake(self._machine, node.name):
-            severity, what = Severity.INFO, "the kernel might have suspended it: forbidden now"
+            severity, what = Severity.INFO, "the kernel was allowed to suspend it: now forbidden"
         else:
             severity = Severity.WARNING
             what = 'the kernel may suspend it; udev rule: ACTION=="add", SUBSYSTEM=="usb", ATTR{power/control}="on"'

@@ -97,7 +97,7 @@ class PortPower:
         name = await self._present_name(name)
         device = await self._machine.offload(lambda: read_device(self._machine.sysfs, name))
         if parent_of(name) is None or (device is not None and device.hub):
-            raise DeviceError(f"{name} is a hub: only ports of single devices are switched")
+            raise DeviceError(f"{name} is a hub: only ports of single devices can be switched")
         self._pace(name, await self._machine.offload(lambda: topology_of(self._machine.sysfs, name)))
         try:
             if method is CycleMethod.UHUBCTL:
@@ -142,7 +142,7 @@ class PortPower:
             pause = min(1 << (count - 1), longest_pause)
             left = pause - (now - last) / SECOND
             if left > 0:
-                raise BusyError(f"{place(name)} was switched just now; again in {left:.1f} s")
+                raise BusyError(f"{place(name)} was switched moments ago; possible again in {left:.1f} s")
         self._cycles[topology] = (min(count + 1, longest_pause), now)
 
     async def _halves(self, name: str) -> list[str]:
@@ -193,8 +193,8 @@ def why_no_node(device: UsbDevice, kind: str, interface: int) -> str:
     who = f"{device.usb_id} {device.title}".rstrip()
     if interface not in device.held:
         return f"{who} has no {kind} at interface {interface}"
-    text = f"{who}: a program holds interface {interface} through usbfs, so that it has no {kind}"
-    brltty = "; brltty does that with such adapters, and install-service prevents it"
+    text = f"{who}: a program holds interface {interface} through usbfs, so no {kind} exists"
+    brltty = "; brltty does this with such adapters, and install-service prevents it"
     return text + brltty * (device.usb_id in BRAILLE)
 
 

@@ -146,7 +146,7 @@ def port_directory(name: str) -> str:
     """
     hub = parent_of(name)
     if hub is None:
-        raise ValueError(f"{name}: a root hub hangs on no port")
+        raise ValueError(f"{name}: a root hub has no port")
     return f"{DEVICES}/{_hub_interface(hub)}/{hub}-port{port_of(name)}"
 
 

@@ -44,7 +44,7 @@ class VescServoConfig(Schema):
     @model_validator(mode="after")
     def _centre_within_limits(self) -> Self:
         if not self.min < self.centre < self.max:
-            raise ValueError(f"min {self.min} < centre {self.centre} < max {self.max} does not hold")
+            raise ValueError(f"expected min {self.min} < centre {self.centre} < max {self.max}")
         return self
 
     def position(self, angle: float) -> float:
@@ -134,7 +134,7 @@ class VescConfig(Schema):
     def _consistent(self) -> Self:
         ids = [motor.can_id for motor in self.motors]
         if len(set(ids)) < len(ids):
-            raise ValueError(f"motors: every can_id may be there once, got {ids}")
+            raise ValueError(f"motors: expected different can_ids, got {ids}")
         if self.watchdog <= 2.0 / self.rate:
             raise ValueError(f"watchdog {self.watchdog:g} s: expected more than two exchanges, {2.0 / self.rate:g} s")
         if self.min_motor_rpm >= self.max_motor_rpm:

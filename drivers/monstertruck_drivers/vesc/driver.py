@@ -203,7 +203,7 @@ class VescDriver(MotorBoard[VescConfig, VescSession]):
             text = f"motor {i + 1}: fault {fault_text(fault)}"
             self._events(Reason.DRIVE_FAULT, Severity.ERROR, self.name, text, code=fault)
         else:
-            self._events(Reason.DEVICE_READY, Severity.INFO, self.name, f"motor {i + 1}: the fault is gone")
+            self._events(Reason.DEVICE_READY, Severity.INFO, self.name, f"motor {i + 1}: the fault has cleared")
 
     def _publish(self, i: int, values: MotorValues, stamp: int, received: int) -> None:
         config, out = self._config, self._outs[i]

@@ -71,7 +71,7 @@ class VescSession:
             if self.heard and can_id is not None:
                 raise DeviceMismatchError(f"{who}no VESC answers at CAN id {can_id}") from error
             if self.deframer.bad and not self.heard:
-                raise WrongDeviceError(f"{who}no VESC, sends {self.deframer.strange.hex(' ')}") from error
+                raise WrongDeviceError(f"{who}not a VESC, it sends {self.deframer.strange.hex(' ')}") from error
             if isinstance(error, PacketError):
                 raise ProtocolError(f"{who}{error}") from error
             raise

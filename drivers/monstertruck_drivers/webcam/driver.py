@@ -60,7 +60,7 @@ def _follow(data: bytes) -> tuple[int, bool]:
         has_tables |= marker == _HUFFMAN
         has_frame |= marker in _FRAME_HEADERS
         at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    raise ValueError(f"header breaks off at byte {at}")
+    raise ValueError(f"header ends at byte {at}")
 
 
 OLDEST: Final = SECOND
@@ -135,7 +135,7 @@ class WebcamDriver:
 
     def _report_mode(self, wanted: Mode, granted: Mode) -> None:
         if granted != wanted and granted != self._reported_mode:
-            text = f"the camera gives {granted}, configured is {wanted}"
+            text = f"the camera offers {granted}, expected {wanted}"
             self._events(Reason.DEVICE_MISMATCH, Severity.INFO, self.name, text)
         self._reported_mode = granted
 
@@ -148,8 +148,8 @@ class WebcamDriver:
                     frame = await stream.next()
             except TimeoutError:
                 if seen == 0:
-                    raise DeviceTimeoutError(f"{self._source.name}: no picture for {timeout} s") from None
-                raise ProtocolError(f"{self._source.name}: {seen} pictures in {timeout} s, none whole") from None
+                    raise DeviceTimeoutError(f"{self._source.name}: no image for {timeout} s") from None
+                raise ProtocolError(f"{self._source.name}: {seen} images in {timeout} s, none complete") from None
             seen += 1
             if self._publish(frame):
                 ready()
@@ -163,7 +163,7 @@ class WebcamDriver:
             data = complete(frame.data)
         except ValueError as error:
             if not self._refusing:
-                self._events(Reason.DEVICE_PROTOCOL, Severity.WARNING, self.name, f"picture refused: {error}")
+                self._events(Reason.DEVICE_PROTOCOL, Severity.WARNING, self.name, f"image rejected: {error}")
             self._refusing = True
             return False
         self._refusing = False
@@ -186,7 +186,7 @@ class WebcamDriver:
             return received
         possible = max(self._stamp, received - OLDEST) <= stamp <= received
         if not possible and not self._doubting:
-            text = f"stamp {(stamp - received) / SECOND:+.3f} s from arrival: arrival times are used"
+            text = f"stamp differs by {(stamp - received) / SECOND:+.3f} s from arrival: arrival times are used"
             self._events(Reason.DEVICE_PROTOCOL, Severity.WARNING, self.name, text)
         self._doubting = not possible
         return stamp if possible else received

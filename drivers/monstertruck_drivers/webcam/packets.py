@@ -58,7 +58,7 @@ def decode_mode(payload: bytes) -> Mode:
         ProtocolError: wrong length.
     """
     if len(payload) != _MODE.size:
-        raise ProtocolError(f"mode takes {_MODE.size} bytes, got {len(payload)}")
+        raise ProtocolError(f"mode needs {_MODE.size} bytes, got {len(payload)}")
     return Mode(*_MODE.unpack(payload))
 
 

@@ -88,7 +88,7 @@ _KINDS: Final[dict[int, type[DeviceError]]] = {
     errno.ETIMEDOUT: DeviceTimeoutError,
 }
 _HINTS: Final = {
-    errno.ENOSPC: "no USB bandwidth left on its hub: ask for a smaller size, or use a port of the other hub",
+    errno.ENOSPC: "no USB bandwidth left on its hub: choose a smaller image size, or use a port of another hub",
     errno.EACCES: "no permission: the user must be in the group 'video'",
     errno.EBUSY: "another program uses the camera",
 }

@@ -64,7 +64,7 @@ class Wt61Session:
                 return await self._stream.first(0.6, "of a WT61: another device, or another baud rate")
             except DeviceTimeoutError:
                 continue
-        raise DeviceTimeoutError(f"{self._link.name}: silence; expected a WT61 that streams")
+        raise DeviceTimeoutError(f"{self._link.name}: silent; expected a WT61 that streams")
 
 
 class Wt61Driver:
@@ -119,7 +119,7 @@ class Wt61Driver:
                         self._publish(kept)
                         kept = []
                 if equal >= self._config.stuck_after:
-                    raise ProtocolError(f"{link.name}: {equal} measurements are the same to the last bit")
+                    raise ProtocolError(f"{link.name}: {equal} measurements in a row are identical")
                 samples = await session.receive(self._config.silence)
 
     def _publish(self, samples: list[ImuSample]) -> None:

@@ -209,7 +209,7 @@ class SimTruckConfig(Schema):
         if len({servo.channel for servo in self.servos}) < len(chassis.straight):
             raise ValueError(f"body {self.body.kind} has {len(chassis.straight)} servos: expected one channel for each")
         if self.dynamics == "single_track" and (chassis.linkage is None or chassis.freedom == "parallel"):
-            raise ValueError(f"dynamics single_track: body {self.body.kind} has no axles that steer it into a curve")
+            raise ValueError(f"dynamics single_track: body {self.body.kind} has no steered axles for curves")
         return self
 
 
@@ -524,7 +524,7 @@ class SonarModelConfig(Schema):
         if not self.range_min < self.range_max <= self.audible:
             raise ValueError(
                 f"range_min {self.range_min} m, range_max {self.range_max} m, audible {self.audible} m: "
-                "expected them to rise"
+                "expected increasing values"
             )
         return self
 
@@ -620,7 +620,7 @@ class PersonConfig(Schema):
     @model_validator(mode="after")
     def _somewhere(self) -> Self:
         if len(self.waypoints) == 1:
-            raise ValueError("waypoints: expected two or more, or none to have them drawn")
+            raise ValueError("waypoints: expected two or more, or none for random ones")
         return self
 
 
@@ -782,14 +782,15 @@ class WorldConfig(Schema):
         if self.engine == "mujoco":
             if self.truck.body.kind not in SOLID_BODIES:
                 raise ValueError(
-                    f"engine mujoco: has no body {self.truck.body.kind}; expected one of {', '.join(SOLID_BODIES)}"
+                    f"engine mujoco: does not support body {self.truck.body.kind}; expected one of "
+                    f"{', '.join(SOLID_BODIES)}"
                 )
             if self.tilt.kind == "sinusoid":
-                raise ValueError("engine mujoco: tilt sinusoid: nothing rocks the robot; expected ground or steady")
+                raise ValueError("engine mujoco: tilt sinusoid: not supported; expected ground or steady")
         elif self.roof is not None:
-            raise ValueError("engine plane: nothing sees a tag on the robot; roof needs engine mujoco")
+            raise ValueError("engine plane: no camera can see a tag on the robot; roof needs engine mujoco")
         elif self.camera.rendered:
-            raise ValueError("engine plane: draws the camera's pictures itself; camera.rendered needs engine mujoco")
+            raise ValueError("engine plane: draws the camera's images itself; camera.rendered needs engine mujoco")
         elif self.ground or self.height_image is not None or self.mjcf is not None:
             raise ValueError("engine plane: has no ground, height_image or mjcf; expected engine mujoco")
         return self

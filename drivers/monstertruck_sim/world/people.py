@@ -173,13 +173,13 @@ class Person:
             x, y = float(self._rng.uniform(left, right)), float(self._rng.uniform(low, high))
             if self._free(x, y, self.radius + SIDE):
                 return x, y
-        raise ValueError(f"found no free place for {self.name} on the map")
+        raise ValueError(f"no free place found for {self.name} on the map")
 
     def _require_free(self) -> None:
         for i, place in enumerate(self._given):
             end = self._given[(i + 1) % len(self._given)]
             if not self._clear(place, end):
-                raise ValueError(f"the way from {place} to {end} touches what is not free")
+                raise ValueError(f"the path from {place} to {end} touches occupied or unknown cells")
 
     def _clear(self, a: Place, b: Place) -> bool:
         count = max(1, round(hypot(b[0] - a[0], b[1] - a[1]) / (self.radius / 2)))

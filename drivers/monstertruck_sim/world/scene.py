@@ -126,7 +126,7 @@ class Surroundings:
         outline = body.outline
         for other in self.bodies:
             if other.name == body.name:
-                raise InputError(f"robot {body.name}: given twice in one world")
+                raise InputError(f"robot {body.name}: two robots of this name in one world")
             if penetration(outline, other.outline) > 0:
                 raise InputError(f"start: the robots {other.name} and {body.name} overlap")
         for person in self.people:

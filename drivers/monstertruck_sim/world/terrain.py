@@ -108,7 +108,7 @@ def load_profile(path: Path) -> Profile:
     except (TypeError, ValueError) as error:
         raise InputError(f"{path}: points: expected a list of [x, z] in metres") from error
     if len(pairs) < 2 or any(b[0] <= a[0] for a, b in pairwise(pairs)):
-        raise InputError(f"{path}: points: expected at least two points with rising x")
+        raise InputError(f"{path}: points: expected at least two points with increasing x")
     return Profile(pairs)
 
 

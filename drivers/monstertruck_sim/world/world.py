@@ -170,7 +170,7 @@ class World:
             InputError: the pose is not collision-free.
         """
         if not self.is_free(pose):
-            raise InputError(f"carry: the robot at {pose} touches what is not free")
+            raise InputError(f"carry: the robot at {pose} touches occupied or unknown cells")
         self._plant.advance(time_ns)
         self._plant.carry(pose)
 

@@ -87,7 +87,9 @@ class RigidSpace(Space):
         kind, people = type(obstacle), [person.disc for person in self._scene.people]
         robots = [body.outline for body in self._others()]
         if sum(isinstance(other, kind) for other in (*self.obstacles, *robots, *people)) >= SPARE:
-            raise InputError(f"obstacle: {SPARE} of kind {kind.__name__.lower()} are in the world: no room for more")
+            raise InputError(
+                f"obstacle: the world already contains the maximum of {SPARE} of kind {kind.__name__.lower()}"
+            )
         super().add(obstacle)
 
     def set_tilt(self, tilt: TiltConfig) -> None:
@@ -97,7 +99,7 @@ class RigidSpace(Space):
             InputError: it is to rock, or does not stand so.
         """
         if tilt.kind == "sinusoid":
-            raise InputError("tilt sinusoid: nothing rocks the robot of engine mujoco; expected ground or steady")
+            raise InputError("tilt sinusoid: not supported with engine mujoco; expected ground or steady")
         pitch, roll = (tilt.pitch_deg, tilt.roll_deg) if tilt.kind == "steady" else (0.0, 0.0)
         self._plant.stand(radians(pitch), radians(roll))
 

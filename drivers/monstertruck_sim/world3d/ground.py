@@ -93,7 +93,7 @@ def _hills(feature: Hills, x: Array, y: Array, starts: Sequence[Pose2]) -> Array
 
 
 def _pictured(config: HeightImage) -> HeightGrid:
-    with picture(config.file, "a picture of heights (sim.world.height_image)") as image:
+    with picture(config.file, "a height image (sim.world.height_image)") as image:
         grey = np.asarray(image.convert("I" if image.mode.startswith("I") else "L"), dtype=np.float64)
         white = 65535.0 if image.mode.startswith("I") else 255.0
     return HeightGrid(np.ascontiguousarray(grey[::-1]) / white * config.height, config.resolution, (config.x, config.y))
@@ -149,9 +149,9 @@ def scenery(path: Path) -> tuple[list[ET.Element], list[ET.Element]]:
         raise InputError(f"sim.world.mjcf: {path}: expected <mujoco>, found <{root.tag}>")
     for tag in ("joint", "freejoint", "flexcomp", "composite", "actuator", "include"):
         if next(root.iter(tag), None) is not None:
-            raise InputError(f"sim.world.mjcf: {path}: <{tag}>: expected geometries that do not move, in one file")
+            raise InputError(f"sim.world.mjcf: {path}: <{tag}>: expected static geometries only, in one file")
     if next(root.iter("default"), None) is not None:
-        raise InputError(f"sim.world.mjcf: {path}: <default>: expected geometries that say all of themselves")
+        raise InputError(f"sim.world.mjcf: {path}: <default>: expected geometries with all attributes written out")
     compiler = {name: value for element in root.findall("compiler") for name, value in element.items()}
     if (sequence := compiler.get("eulerseq", "xyz")) != "xyz":
         raise InputError(f"sim.world.mjcf: {path}: compiler eulerseq {sequence}: expected xyz")

@@ -46,7 +46,7 @@ class Film:
         if file.suffix.lower() != ".gif":
             raise InputError(f"{file}: expected a name that ends with .gif")
         if not isinstance(world.plant, RigidPlant):
-            raise InputError(f"{file}: only sim.world.engine mujoco can be filmed")
+            raise InputError(f"{file}: recording needs sim.world.engine mujoco")
         self._world, self._clock, self._plant = world, clock, world.plant
         self._renderer = WorldRenderer(world.plant.model, 480, 320)
         self._heading = world.plant.pose[2]

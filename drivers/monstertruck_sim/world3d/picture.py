@@ -69,16 +69,14 @@ class WorldRenderer:
             from mujoco.egl import GLContext  # noqa: PLC0415  # raises where there is no EGL
         except (ImportError, AttributeError) as error:
             raise NotInstalledError(
-                f"pictures: no EGL on this computer (Debian: apt install libegl1): {error}"
+                f"images: no EGL on this computer (Debian: apt install libegl1): {error}"
             ) from error
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         self._model = model
         try:
             self._gl = GLContext(width, height)
         except RuntimeError as error:
-            raise NotInstalledError(
-                f"pictures: EGL cannot render (Debian: apt install libegl-mesa0): {error}"
-            ) from error
+            raise NotInstalledError(f"images: EGL cannot render (Debian: apt install libegl-mesa0): {error}") from error
         self._gl.make_current()
         self._scene = mujoco.MjvScene(model, maxgeom=5000)
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)

@@ -174,7 +174,7 @@ class RigidPlant(Plant):
             # 0.1: maximum difference between the tilts of robot and blocks that its springs explain, rad
             if hypot(self._attitude[0] - pitch, self._attitude[1] - roll) > 0.1:
                 wanted = f"pitch {degrees(pitch):.0f} deg and roll {degrees(roll):.0f} deg"
-                raise InputError(f"tilt: the robot falls off blocks that give it {wanted}")
+                raise InputError(f"tilt: the robot falls off blocks that tilt it by {wanted}")
         except InputError:
             self._on_blocks = before
             self.carry(self._pose)
@@ -235,7 +235,9 @@ class RigidPlant(Plant):
         inside = data.ncon > 0 and data.contact.dist.min() < -0.03  # maximum plausible depth of a contact, m
         # 0.5: vertical speed that a robot at rest cannot have, m/s
         if self._unstable() or inside or not abs(data.qvel[2]) < 0.5:
-            raise InputError(f"the robot does not come to rest at ({x:.2f}, {y:.2f}): something is in its place there")
+            raise InputError(
+                f"the robot does not come to rest at ({x:.2f}, {y:.2f}): another object occupies this place"
+            )
         data.qvel[:] = 0.0
         mujoco.mj_forward(self.model, data)
         self._twist, self._stuck_at = (0.0, 0.0, 0.0), None

@@ -1,7 +1,7 @@
-"""Errors that the wizards assume of tape, board, floor, tyres and sensors, in one place: the budget of their intervals.
+"""Error budget of the wizards' intervals: assumed errors of tape, board, floor, tyres and sensors.
 
-Each is a standard deviation, unless it says otherwise. A number here is a property of the workshop, not of the method:
-a glass board or another tape has its own.
+Each value is a standard deviation unless its docstring states otherwise. The values describe the workshop, not the
+method: adapt them to a glass board or a better tape.
 """
 
 import math
@@ -15,14 +15,14 @@ Share = Annotated[float, Field(gt=0, le=1)]
 
 
 class AssumedErrors(Schema):
-    """What no wizard can measure."""
+    """Errors that no wizard can measure."""
 
     board_flatness: Positive = 0.001
-    """Distance of a board's middle from its plane (m)."""
+    """Deviation of a board's middle from its plane (m)."""
     board_warp: Positive = 0.003
-    """Direction of a line on a board (rad)."""
+    """Direction error of a line on a board (rad)."""
     board_range: Positive = 0.004
-    """Excess of the lidar's range on a board's surface (m)."""
+    """Excess of the lidar's range on the surface of a board (m)."""
     board_size: Share = 0.003
     """Relative error of a board's size: a ruler, and paper."""
     tape_reading: Positive = 0.002
@@ -38,45 +38,49 @@ class AssumedErrors(Schema):
     floor_slip: Share = 0.003
     """Relative change of a distance driven on another floor; half a 95 % interval."""
     leg_direction: Positive = 0.005
-    """Direction of travel on one leg, by tyres (rad)."""
+    """Error of the direction of travel on one leg, from the tyres (rad)."""
     leg_distance: Share = 0.006
-    """Relative distance of one leg, by slip."""
+    """Relative distance error of one leg, from slip."""
     turning_centre: Positive = 0.002
-    """Distance of the turning centre of all arcs ahead or behind, by tyres that slip outward (m)."""
+    """Longitudinal shift of the turning centre of all arcs, from tyres that slip outwards (m)."""
     square_place: Positive = 0.03
-    """Final position of a square, by slip over 10 m (m)."""
+    """Position error at the end of a square, from slip over 10 m (m)."""
     square_linkage: Share = 0.004
-    """Relative error of a linkage's polynomials in the turn of a square; half a 95 % interval."""
+    """Relative error of the linkage's polynomials in the turn of a square; half a 95 % interval."""
     square_on_the_spot: Share = 0.004
-    """Relative turn of the body by steering at standstill at the ends of a corner; half a 95 % interval: 0.005 rad
-    among rigid bodies."""
+    """Relative turn of the body caused by steering at standstill at the ends of a corner; half a 95 % interval: 0.005
+    rad with rigid bodies.
+    """
     sliding: Share = 0.004
-    """Relative error of a skidding body's model: of the distance, along and across, and of the turn."""
+    """Relative error of the model of a skidding body: longitudinal distance, lateral distance and turn."""
     rest_position: Positive = 0.0005
-    """Minimum of a position at rest (m)."""
+    """Minimum position error at rest (m)."""
     rest_heading: Positive = 0.001
-    """Minimum of a heading at rest (rad)."""
+    """Minimum heading error at rest (rad)."""
     sonar_noise: tuple[Positive, Share] = (0.005, 0.01)
-    """Range of a sonar: m, and share of it, added in quadrature."""
+    """Range error of a sonar: constant part (m) and fraction of the range, added in quadrature."""
     sonar_arc: tuple[Positive, Positive, Share] = (0.003, 0.003, 0.01)
-    """Odometry on an arc: distance from the wall (m) and heading (rad) since the previous arc, and relative excess of
-    the turn, due to gyroscopes and slipping wheels."""
+    """Odometry error on an arc: distance from the wall (m), heading since the previous arc (rad), and relative excess
+    of the turn from gyroscopes and slipping wheels.
+    """
     sonar_scale: tuple[Share, Share] = (0.01, 0.003)
-    """Shares, before anything is measured: of the speed of sound (6 degrees Celsius), and of the distance by odometry,
-    as wheels roll a little further or less far on another floor or under another load."""
+    """Relative errors before the measurement: of the speed of sound (6 degrees Celsius), and of the distance by
+    odometry (other floors and loads).
+    """
     turn_heading: Positive = 0.002
-    """Turn between two rests (rad): rounding and noise of averaged headings."""
+    """Turn error between two rests (rad): rounding and noise of averaged headings."""
     turn_compass: Positive = 0.006
-    """Turn by the compass's own slow error over the heading (rad); none for a full turn."""
+    """Turn error from the heading-dependent error of the compass (rad); zero for a full turn."""
     turn_slip: Positive = 0.004
-    """Turn per root metre by tyres that never roll quite along their plane (rad)."""
+    """Turn error per root metre, from tyres that do not roll exactly along their plane (rad)."""
     turn_linkage: Share = 0.005
     """Relative error of the linkage's polynomials in a turn."""
     weave_linearity: Positive = 1.5e-4
-    """Square of the lag (s^2) that a curvature looks like which is 2 % from linear in the angles."""
+    """Apparent square of the lag (s^2) caused by a curvature that deviates from linearity by 2 %."""
     servo_wait: Positive = 0.010
-    """Half the period of the servo pulses (s), half a uniform interval. How long a command waits for the next pulse is
-    constant while the daemon runs, and another time after each start: nothing in the period can be excluded."""
+    """Half the period of the servo pulses (s): half a uniform interval. The wait of a command for the next pulse is
+    constant while the daemon runs and differs after each start.
+    """
 
     def beam_angle(self, tape: float, apart: float) -> float:
         """Return the error of a beam's angle to the body (rad), by two heights and the compass.

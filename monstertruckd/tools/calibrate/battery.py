@@ -1,7 +1,7 @@
-"""Scale of the battery voltage from a multimeter, and its offset as far as readings lie apart.
+"""Scale of the battery voltage from a multimeter, and its offset if the readings cover different voltages.
 
-``volts = gain * raw + offset``, ``raw`` being the input's reading with gain 1 and offset 0. A pack moves by 4 V
-between full and empty, so a second reading usually comes days later: readings are kept with the result and used again.
+``volts = gain * raw + offset``, where ``raw`` is the input's reading with gain 1 and offset 0. A pack changes by 4 V
+between full and empty, so a second reading is usually taken days later: readings are saved with the result and reused.
 """
 
 import math
@@ -21,8 +21,8 @@ from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, estimated
 from monstertruckd.tools.calibrate.steps import Collect, Confirm, Number, Plot
 from monstertruckd.tools.calibrate.wizard import WizardContext
 
-METER: Final = Number("meter", "Voltage of the pack at its plug by the multimeter, V", 5.0, 70.0)
-ANOTHER: Final = Confirm("another", "Take another reading now, with the pack at another voltage?", fact=True)
+METER: Final = Number("meter", "Pack voltage measured with the multimeter at the plug, V", 5.0, 70.0)
+ANOTHER: Final = Confirm("another", "Take another reading now, with the pack charged to another voltage?", fact=True)
 EARTHING: Final = 0.1
 """Maximum offset, V: 10 mV along the ground wire, times the divider."""
 EVEN: Final = math.sqrt(3)
@@ -31,7 +31,7 @@ EVEN: Final = math.sqrt(3)
 
 @dataclass(frozen=True, slots=True)
 class MeterReading:
-    """The same pack by input and by meter."""
+    """One pack voltage, measured by the input and by the meter."""
 
     raw: float
     volts: float
@@ -41,22 +41,22 @@ class MeterReading:
 
 @dataclass(frozen=True, slots=True)
 class BatteryWizard:
-    """One or more readings of a multimeter."""
+    """Wizard with one or more readings of a multimeter."""
 
     name: ClassVar[WizardName] = "battery"
-    doc: ClassVar[str] = "scale of the battery voltage from a multimeter, and its offset from two readings apart"
+    doc: ClassVar[str] = "scale of the battery voltage from a multimeter; its offset if the readings cover two voltages"
     room: ClassVar[str] = ""
     meter_share: float = 0.005
-    """Maximum error of the multimeter as a fraction of its reading"""
+    """Maximum error of the multimeter, as a fraction of its reading"""
     meter_digits: float = 0.02
     """Maximum constant error of the meter (V)"""
     samples: int = 50
     fresh: bool = False
-    """Forget the readings of earlier runs"""
+    """Discard the readings of earlier runs"""
 
     @classmethod
     def of(cls, meter_error: float, meter_digits: float, fresh: bool) -> Self:
-        """Build it from the command's options: the meter's proportional and constant error."""
+        """Create it from the command's options: the proportional and constant error of the meter."""
         return cls(meter_error, meter_digits, fresh=fresh)
 
     async def __call__(self, context: WizardContext) -> Result:
@@ -65,7 +65,7 @@ class BatteryWizard:
         gain, offset = (float(context.value(key)) for key in keys)
         earlier = context.known.get("battery")
         readings = [] if self.fresh or earlier is None else [MeterReading(*row) for row in earlier.readings]
-        context.say("Measure at rest, with everything switched on that is always on; the robot does not move.")
+        context.say("Measure at rest, with all permanent loads switched on; the robot does not move.")
         while True:
             volts = await context.ask(METER)
             taken = await context.collect(Collect("battery voltage", topics.BATTERY, self.samples, 30.0))
@@ -95,11 +95,11 @@ class BatteryWizard:
             return "monitors.battery.divider", "monitors.battery.offset"
         if config.devices.steering is not None and config.devices.steering.driver.battery is not None:
             return f"{STEERING}.battery.gain", f"{STEERING}.battery.offset"
-        raise RequestRefusedError(Reason.NOT_SUPPORTED, "this robot measures no battery voltage")
+        raise RequestRefusedError(Reason.NOT_SUPPORTED, "this robot does not measure a battery voltage")
 
     @staticmethod
     def _step(context: WizardContext) -> float:
-        """Rounding of one raw reading, V; 0 where the converter is fine enough."""
+        """Rounding of one raw reading, V; 0 if the converter's resolution is fine enough."""
         steering = context.config.devices.steering
         coarse = (
             context.config.monitors.battery is None and steering is not None and steering.driver.battery is not None
@@ -110,9 +110,11 @@ class BatteryWizard:
     def _reading(taken: list[Battery], volts: float, gain: float, offset: float, step: float) -> MeterReading:
         raw = (np.array([message.raw_voltage for message in taken]) - offset) / gain
         if raw.min() <= 0 or raw.std() > 0.02 * raw.mean():
-            raise InputError(f"the input reads {raw.min():.2f} to {raw.max():.2f} V: no steady voltage to compare with")
-        # 0.5: part of the rounding of one reading that is left in their mean: noise averages it out, but is never
-        # relied on
+            raise InputError(
+                f"the battery input varies from {raw.min():.2f} to {raw.max():.2f} V: the voltage must be "
+                "steady for the comparison"
+            )
+        # 0.5: part of the rounding error of one reading that may remain in the mean; noise usually averages it out
         rounding = 0.5 * step / math.sqrt(12)
         return MeterReading(float(raw.mean()), volts, math.hypot(float(raw.std()) / math.sqrt(raw.size), rounding))
 
@@ -121,38 +123,39 @@ class BatteryWizard:
         gain, offset = self.scale(readings)
         observed = offset.half < 0.9 * EARTHING
         bounds = (
-            f"pack volts; 95 % of the meter's {self.meter_share:.1%} and {self.meter_digits:g} V, the input's "
-            f"rounding, and at most {EARTHING:g} V along the ground wire"
+            f"pack volts; 95 % interval from the meter's accuracy ({self.meter_share:.1%} and "
+            f"{self.meter_digits:g} V), the rounding of the input, and up to {EARTHING:g} V of drop on "
+            "the ground wire"
         )
         estimates = tuple(
             estimated(name, found, unit, len(readings), f"{what} {bounds}", key)
             for name, found, unit, what, key in (
-                ("gain", gain, "", "factor from the input's reading to", keys[0]),
-                ("offset", offset, "V", "added to get", keys[1]),
+                ("gain", gain, "", "factor from the input voltage to", keys[0]),
+                ("offset", offset, "V", "offset added to obtain", keys[1]),
             )
         )
         return Result(
             wizard="battery",
-            measured=f"{len(readings)} readings of a multimeter, {min(volts):.2f} to {max(volts):.2f} V",
+            measured=f"{len(readings)} multimeter readings from {min(volts):.2f} to {max(volts):.2f} V",
             estimates=estimates,
-            unobserved=() if observed else ("the offset: it takes readings of a fuller and an emptier pack",),
+            unobserved=() if observed else ("the offset: it needs readings of a fuller and an emptier pack",),
             readings=tuple((reading.raw, reading.volts, reading.error) for reading in readings),
         )
 
     def scale(self, readings: list[MeterReading]) -> tuple[Interval, Interval]:
-        """Gain and offset, by least squares.
+        """Fit gain and offset by least squares.
 
-        The meter's proportional error has the same sign at every reading, the error of its digits is independent.
-        Errors with only a known bound are taken as uniform within it.
+        The meter's proportional error is common to all readings, its digit error is independent. Errors with only a
+        known bound are assumed to be uniform within it.
 
         Raises:
-            InputError: no line passes every reading within its bounds.
+            InputError: no line fits every reading within its bounds.
         """
         raw = np.array([reading.raw for reading in readings])
         volts = np.array([reading.volts for reading in readings])
         noise = np.array([reading.error for reading in readings]) * volts / raw
         self._check(raw, volts, NORMAL * noise)
-        # 1e-4: error of a reading at least, V: less no multimeter states, and no fit bears
+        # 1e-4: minimum error of a reading, V
         sigma = np.maximum(np.hypot(self.meter_digits / EVEN, noise), 1e-4)
         share = max(self.meter_share, 1e-6)
         rows = np.vstack(
@@ -165,21 +168,24 @@ class BatteryWizard:
         errors = np.linalg.inv(rows.T @ rows)
         gain, offset, _ = errors @ rows.T @ np.concatenate((volts / sigma, (0.0, 0.0)))
         halves = NORMAL * np.sqrt(np.diag(errors))
-        # The offset is limited to that of the ground wire; the gain follows it, so that both fit the readings.
+        # The ground wire limits the offset; the gain is adapted, so that both fit the readings.
         low, high = np.clip((offset - halves[1], offset + halves[1]), -EARTHING, EARTHING).tolist()
         within = Interval((low + high) / 2, (high - low) / 2)
         gain += errors[0, 1] / errors[1, 1] * (within.value - offset)
         return Interval(float(gain), float(halves[0])), within
 
     def _check(self, raw: Array, volts: Array, noise: Array) -> None:
-        """Raise where no gain and offset explain all readings: each leaves a range of gains for an offset."""
+        """Raise InputError if no gain and offset explain all readings.
+
+        Each reading leaves a range of gains for an offset.
+        """
         bounds = self.meter_share * volts + self.meter_digits + noise
         offsets = np.linspace(-EARTHING, EARTHING, 201)[:, None]
         low, high = (volts - bounds - offsets) / raw, (volts + bounds - offsets) / raw
         if not (low.max(axis=1) <= high.min(axis=1)).any():
             raise InputError(
-                f"no scale fits all {len(raw)} readings: a slip, or the divider has changed; forget the earlier "
-                "readings with --fresh"
+                f"no scale fits all {len(raw)} readings: a reading was mistyped or the voltage divider "
+                "has changed; discard the earlier readings with --fresh"
             )
 
 
@@ -192,11 +198,11 @@ def check_input(reading: MeterReading, gain: float) -> None:
     shown = reading.raw * gain
     if not volts_near(shown, reading.volts):
         raise InputError(
-            f"the input reads {shown:.1f} V where the meter shows {reading.volts:.1f} V: a cable on another input, or "
-            "another divider than configured"
+            f"the input reads {shown:.1f} V but the meter shows {reading.volts:.1f} V: check that the "
+            "cable is on the configured input and that the divider matches the configuration"
         )
 
 
 def volts_near(shown: float, volts: float) -> bool:
-    """Whether two voltages may be the same pack's by inputs that are wrong by a factor of two at most."""
+    """Whether two voltages may be of the same pack, if the divider is wrong by a factor of two at most."""
     return volts / 2 < shown < 2 * volts

@@ -1,4 +1,4 @@
-"""Ranges of several scans, beam by beam."""
+"""Ranges of several scans, by beam."""
 
 from collections.abc import Sequence
 
@@ -10,7 +10,7 @@ from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
 
 
 def bearings_of(scan: LaserScan) -> Array:
-    """Bearings of its beams, shape (n,), rad."""
+    """Bearings of a scan's beams, shape (n,), rad."""
     return scan.start_angle + scan.angle_increment * np.arange(len(scan.ranges), dtype=np.float64)
 
 
@@ -29,7 +29,7 @@ def stacked_ranges(scans: Sequence[LaserScan], missing: float) -> Array:
 
 
 def _along(bearings: Array, scan: LaserScan, missing: float) -> Array:
-    """Ranges of the beams nearest to the bearings (n,), m."""
+    """Ranges of the beams closest to the bearings (n,), m."""
     measured = np.where(scan.codes == VALID_BEAM, scan.ranges, missing)
     beams = nearest_beams(bearings, scan.start_angle, scan.angle_increment)
     return np.append(measured, missing)[np.minimum(beams, len(measured))]

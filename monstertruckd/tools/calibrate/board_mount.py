@@ -1,10 +1,10 @@
-"""Mount of the camera from a board that camera and lidar see: points of the lidar's line lie in the camera's plane.
+"""Camera mount from a board seen by camera and lidar: the lidar's points on it lie in the plane seen by the camera.
 
 Zhang and Pless, "Extrinsic calibration of a camera and laser range finder (improves camera calibration)", IROS 2004: in
-every view the camera knows the board's plane, and the lidar's points on the board have to lie in it. A view gives two
-equations, how far the middle of the line is off the plane and how it is turned against it; views of other tilts give
-others, and six at least tell the six numbers of the mount. Fitted besides: how large the board really is, and by how
-much the lidar measures too far.
+every view the camera measures the plane of the board, and the lidar's points on the board must lie in it. A view gives
+two equations: the distance of the line's middle from the plane, and the angle between line and plane. At least six
+views with different tilts determine the six parameters of the mount. The fit also estimates the true size of the board
+and the lidar's range excess.
 """
 
 import math
@@ -28,7 +28,7 @@ from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.calibrate.board_views import BoardView
 
 NAMES: Final = ("x", "y", "z", "yaw", "pitch", "roll")
-"""Parameters of a mount."""
+"""Parameters of the camera mount."""
 LEAST_VIEWS: Final = 6
 REACH: Final = np.array((0.5, 0.5, 0.5, 0.8, 0.8, 0.8))
 """Maximum error of the configured mount, m and rad."""
@@ -38,9 +38,9 @@ class LidarPlace(NamedTuple):
     """Mount of the lidar on the body, as configured."""
 
     place: Array
-    """(3,), m."""
+    """Position, shape (3,), m."""
     axes: Array
-    """(3, 3): from its axes to the axes of the body."""
+    """Rotation, shape (3, 3), from the lidar's axes to the axes of the body."""
 
     @classmethod
     def of(cls, mount: Mount, pitch: float = 0.0, roll: float = 0.0) -> "LidarPlace":
@@ -51,28 +51,28 @@ class LidarPlace(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class BoardLine:
-    """A board seen by both."""
+    """A board seen by camera and lidar."""
 
     pose: BoardPose
-    """Pose of the board before the camera"""
+    """Pose of the board in front of the camera"""
     ends: Array
-    """(2, 3): of the lidar's line on it, in the lidar's axes, m"""
+    """Ends of the lidar's line on the board, in the lidar's axes, shape (2, 3), m"""
     sigmas: tuple[float, float]
-    """Standard deviations of how far the line's middle is off the plane, m, and of its turn, rad"""
+    """Standard deviations: distance of the line's middle from the plane, m, and angle between line and plane, rad"""
 
 
 def line_on_board(
     view: BoardView, reader: BoardReader, lens: Lens, mount: Array, lidar: LidarPlace, *, known: bool
 ) -> BoardLine | None:
-    """The lidar's line on the board of a view, or None.
+    """Find the lidar's line on the board of a view; None if there is none.
 
     Args:
-        view: with scans.
+        view: view with scans.
         reader: reader of the board.
         lens: lens of the camera.
         mount: mount of the camera, ``NAMES``.
-        lidar: where it is.
-        known: the mount has been fitted.
+        lidar: mount of the lidar.
+        known: whether the mount has already been fitted.
     """
     pose = board_pose(view.sighting, reader, lens)
     if pose is None or not view.ranges.size:
@@ -80,14 +80,14 @@ def line_on_board(
     finite = np.isfinite(view.ranges)
     flat = np.where(finite, view.ranges, 0.0)[:, None] * directions(view.angles)
     on = in_board(flat, pose, mount, lidar)
-    # (0.12, 0.0): m: by how much they may miss the board, at first and once the mount is known
+    # (0.12, 0.0): m: tolerance around the board, before and after the mount is known
     board, margin = reader.board, (0.12, 0.0)[known]
     inside = (on[:, 0] > -margin) & (on[:, 0] < board.width + margin)
     inside &= (on[:, 1] > -margin) & (on[:, 1] < board.height + margin)
-    edges = 2  # beams at both ends of the board that may have met its edge
-    # (0.2, 0.04): m: how far beams may be off the board's plane, at first and once the mount is known
+    edges = 2  # number of beams at each end of the board that may have hit its edge
+    # (0.2, 0.04): m: tolerance around the board's plane, before and after the mount is known
     run = longest(finite & inside & (np.abs(on[:, 2]) < (0.2, 0.04)[known]), view.ranges)[edges:-edges]
-    if run.size < 10:  # beams on the board
+    if run.size < 10:  # minimum number of beams on the board
         return None
     points = flat[run]
     middle = points.mean(axis=0)
@@ -112,27 +112,29 @@ def line_on_board(
 
 
 def directions(angles: Array) -> Array:
-    """Unit vectors of beams in the lidar's axes, (n, 3)."""
+    """Unit vectors of beams in the lidar's axes, shape (n, 3)."""
     return np.column_stack((np.cos(angles), np.sin(angles), np.zeros(angles.size)))
 
 
 def in_camera(points: Array, mount: Array, lidar: LidarPlace) -> Array:
-    """Return lidar points in the camera's axes, m; input and result (n, 3)."""
+    """Transform lidar points to the camera's axes, m; input and result (n, 3)."""
     x, y, z, yaw, pitch, roll = mount.tolist()
     on_body = points @ lidar.axes.T + lidar.place
     return np.asarray((on_body - (x, y, z)) @ camera_axes(yaw, pitch, roll))
 
 
 def in_board(points: Array, pose: BoardPose, mount: Array, lidar: LidarPlace) -> Array:
-    """Return lidar points in the board's axes, m: right, down, and behind it; input and result (n, 3)."""
+    """Transform lidar points to the board's axes (right, down, behind), m; input and result (n, 3)."""
     return np.asarray((in_camera(points, mount, lidar) - pose.place) @ pose.axes)
 
 
 def longest(chosen: NDArray[np.bool_], ranges: Array) -> NDArray[np.intp]:
-    """Indices of the longest run of beams that are chosen, without a step of their ranges."""
+    """Indices of the longest run of selected beams without a step of their ranges."""
     step = np.zeros(chosen.size, dtype=bool)
     with np.errstate(invalid="ignore"):
-        step[1:] = ~(np.abs(np.diff(ranges)) < 0.05)  # step of the range from beam to beam that no board makes, m
+        step[1:] = ~(
+            np.abs(np.diff(ranges)) < 0.05
+        )  # minimum range step between adjacent beams that cannot be on the board, m
     groups = np.cumsum(~chosen | step)
     numbers, counts = np.unique(groups[chosen], return_counts=True)
     if not numbers.size:
@@ -141,11 +143,11 @@ def longest(chosen: NDArray[np.bool_], ranges: Array) -> NDArray[np.intp]:
 
 
 def plane_sigmas(view: BoardView, reader: BoardReader, lens: Lens, pose: BoardPose, ends: Array) -> tuple[float, float]:
-    """Standard deviations by the noise of the corners: of the plane at a line's middle, m, and of its slope, rad.
+    """Standard deviations from the noise of the corners: plane at the middle of the line, m, and its slope, rad.
 
     Args:
         view: view of the board.
-        reader: that found it.
+        reader: reader that found the board.
         lens: lens of the camera.
         pose: pose of the board.
         ends: ends of the line, in the camera's axes, m, (2, 3).
@@ -168,13 +170,13 @@ def plane_sigmas(view: BoardView, reader: BoardReader, lens: Lens, pose: BoardPo
 
 
 def residuals(parameters: Array, lines: Sequence[BoardLine], lidar: LidarPlace) -> Array:
-    """Residuals of lines against planes, over their standard deviations, (n, 2).
+    """Residuals of lines against planes, in standard deviations, shape (n, 2).
 
     Args:
-        parameters: mount (``NAMES``), the board's size as a fraction of the stated size, and the lidar's range excess,
+        parameters: mount (``NAMES``), size of the board as a fraction of the stated size, and the lidar's range excess,
             m.
-        lines: seen.
-        lidar: where it is.
+        lines: lines on the board.
+        lidar: mount of the lidar.
     """
     mount, size, far = parameters[:6], parameters[6], parameters[7]
     ends = np.array([line.ends for line in lines])
@@ -189,13 +191,13 @@ def residuals(parameters: Array, lines: Sequence[BoardLine], lidar: LidarPlace) 
 
 
 def fit(lines: Sequence[BoardLine], mount: Array, lidar: LidarPlace, size_error: float) -> FitResult:
-    """Solve by least squares; parameters as in ``residuals``.
+    """Fit the mount by least squares; parameters as in ``residuals``.
 
     Args:
-        lines: seen.
+        lines: lines on the board.
         mount: first guess.
-        lidar: where it is.
-        size_error: standard deviation of the board's size, as a share.
+        lidar: mount of the lidar.
+        size_error: standard deviation of the board's relative size.
     """
     start = np.array((*mount, 1.0, 0.0))
     reach = np.array((*REACH, 0.5, 0.05))
@@ -210,18 +212,18 @@ def fit(lines: Sequence[BoardLine], mount: Array, lidar: LidarPlace, size_error:
 def fit_mount(
     views: Sequence[BoardView], reader: BoardReader, lens: Lens, mount: Array, lidar: LidarPlace, focal_error: float
 ) -> tuple[FitResult, list[BoardLine]]:
-    """The camera's mount, and the lines it rests on.
+    """Fit the camera's mount; return it with the lines used.
 
     Args:
         views: views of the board, with scans.
-        reader: that found them.
+        reader: reader that found the boards.
         lens: lens of the camera.
-        mount: as configured.
-        lidar: where it is.
-        focal_error: standard deviation of the focal length, as a share: it shows as the board's size.
+        mount: configured mount.
+        lidar: mount of the lidar.
+        focal_error: relative standard deviation of the focal length, which has the same effect as the board's size.
 
     Raises:
-        InputError: too few views, a board of another size, or views that do not fit each other.
+        InputError: too few views, a board of another size, or inconsistent views.
     """
     found = mount
     unknown = 0.3  # standard deviation before the lidar is used
@@ -229,8 +231,8 @@ def fit_mount(
         lines = [o for v in views if (o := line_on_board(v, reader, lens, found, lidar, known=known)) is not None]
         if len(lines) < LEAST_VIEWS:
             raise InputError(
-                f"the lidar sees the board in {len(lines)} of {len(views)} views: expected {LEAST_VIEWS}; is its mount "
-                "right to 10 cm and 10 degrees in the configuration, and the camera's?"
+                f"the lidar sees the board in {len(lines)} of {len(views)} views: expected {LEAST_VIEWS}; "
+                "check that the configured mounts of lidar and camera are right to 10 cm and 10 degrees"
             )
         loose = fit(lines, found, lidar, unknown)
         lines = _agreeing(lines, loose, lidar)
@@ -241,32 +243,33 @@ def fit_mount(
 
 
 def _agreeing(lines: list[BoardLine], found: FitResult, lidar: LidarPlace) -> list[BoardLine]:
-    """Fit without strays, at most one in five.
+    """Fit without outliers, at most one view in five.
 
     Raises:
-        InputError: there are more.
+        InputError: there are more outliers.
     """
     off = np.abs(residuals(found.parameters, lines, lidar)).max(axis=1)
-    # 5.0: residual of a view that does not belong to the others, in standard deviations
+    # 5.0: minimum residual of an outlier, in standard deviations
     limit = 5.0 * max(1.0, float(np.median(off)))
     kept = [line for line, residual in zip(lines, off.tolist(), strict=True) if residual < limit]
     if len(kept) < max(LEAST_VIEWS, 0.8 * len(lines)):
         raise InputError(
-            f"{len(lines) - len(kept)} of {len(lines)} views do not fit the others: the board is not flat, or "
-            "something else stands in the lidar's way"
+            f"{len(lines) - len(kept)} of {len(lines)} views do not fit the others: the board is bent, or "
+            "another object is in the lidar's view"
         )
     return kept
 
 
 def _check_size(found: FitResult, board: BoardConfig) -> None:
-    """Refuse a board printed at another scale, as measured by the lidar.
+    """Refuse a board whose printed size, measured by the lidar, differs from the stated size.
 
     Raises:
-        InputError: so it is.
+        InputError: the sizes differ.
     """
     size, sigma = float(found.parameters[6]), float(found.standard_errors[6])
     if abs(size - 1.0) > 0.01 + 3.0 * sigma:  # minimum relative error of the board's size for a report
         raise InputError(
-            f"by the lidar the board is {size:.3f} times as large as stated: measure a square, "
-            f"{1000 * size * board.square:.1f} mm instead of {1000 * board.square:.1f}; state --square and --marker"
+            f"according to the lidar, the board is {size:.3f} times as large as stated: measure a square "
+            f"({1000 * size * board.square:.1f} mm instead of {1000 * board.square:.1f}) and state "
+            "--square and --marker"
         )

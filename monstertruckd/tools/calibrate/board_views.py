@@ -1,7 +1,7 @@
 """Camera views of a hand-held board, and the views still missing; free of side effects, image by image.
 
-A view is valid if the board was held still for a moment: its corners are averaged over that time, and it includes the
-lidar scans of the same time.
+A view is valid if the operator held the board still for a moment: its corners are averaged over that time, and it
+includes the lidar scans of that time.
 """
 
 import math
@@ -30,12 +30,12 @@ ROWS: Final = ("upper", "middle", "lower")
 COLUMNS: Final = ("left", "middle", "right")
 TILT: Final = math.radians(12.0)
 STEEP: Final = math.radians(30.0)
-SIDES: Final = ("left edge nearer", "right edge nearer", "upper edge nearer", "lower edge nearer")
+SIDES: Final = ("left edge closer", "right edge closer", "top edge closer", "bottom edge closer")
 
 
 @dataclass(frozen=True)
 class BoardView:
-    """The board, held still."""
+    """View of a board held still."""
 
     sighting: BoardSighting
     """Corners, averaged over the images of the view"""
@@ -69,11 +69,11 @@ class BoardAttempts:
 
 @dataclass
 class BoardGuide:
-    """Takes images, keeps views, and lists the missing ones.
+    """Collects images, keeps valid views, and lists the missing ones.
 
     Args:
         reader: reader of the board.
-        lens: as configured; used only to judge tilts and distances.
+        lens: configured lens, used only to judge tilts and distances.
         beams: whether the lidar also sees the board in a view; None without a lidar.
         patience: timeout without a new view (s).
     """
@@ -92,7 +92,7 @@ class BoardGuide:
     def take(
         self, stamp: int, sighting: BoardSighting | None, scans: Iterable[LaserScan] = (), *, damaged: bool = False
     ) -> BoardView | None:
-        """Take the next image; return the view that it completes, if any.
+        """Process the next image; return the view that it completes, if any.
 
         Args:
             stamp: image time (ns).
@@ -153,15 +153,15 @@ class BoardGuide:
 
     def missing(self) -> list[str]:
         """Describe the views still needed."""
-        found = [f"the board in the {cell} of the picture" for cell in self.uncovered()]
+        found = [f"the board in the {cell} of the image" for cell in self.uncovered()]
         if self.views and not self.uncovered():
             distances = [view.pose.place[2] for view in self.views]
             if max(distances) < 1.3 * min(distances):  # ratio of the farthest to the nearest view distance
-                found.append(f"the board at more distances, not only {min(distances):.2f} to {max(distances):.2f} m")
-        found += self._tilts(self.views, 3, "")  # views needed with a larger tilt, to each of four sides
-        found += _more(24 - len(self.views), "view of it", "views of it")
+                found.append(f"the board at more distances than {min(distances):.2f} to {max(distances):.2f} m")
+        found += self._tilts(self.views, 3, "")  # number of views with a larger tilt needed for each of four sides
+        found += _more(24 - len(self.views), "view of the board", "views of the board")
         if self.beams is not None:
-            # 3: views needed that the lidar also sees
+            # 3: number of views needed that the lidar also sees
             found += self._tilts(self.seen_by_lidar, 3, ", across the lidar's beam")
             found += self._steep()
             if self.views and not any(view.ranges.size for view in self.views):
@@ -189,17 +189,17 @@ class BoardGuide:
     def _steep(self) -> list[str]:
         poses = [view.pose for view in self.seen_by_lidar]
         steep = f"by {math.degrees(STEEP):.0f} degrees or more, across the lidar's beam"
-        # 8: views seen by the lidar, tilted by more than ``STEEP``, for each of upper and lower edge nearer: only these
-        # determine the camera's height and pitch, the pitch to 0.5 degrees
+        # 8: number of views with a tilt above ``STEEP``, also seen by the lidar, needed for each of top and bottom edge
+        # closer: only these determine the camera's height and pitch, the pitch to 0.5 degrees
         found = [
             f"its {side} {steep} ({more} more)"
             for side, sign in zip(SIDES[2:], (1, -1), strict=True)
             if (more := 8 - sum(sign * pose.lean > STEEP for pose in poses)) > 0
         ]
         distances = [float(pose.place[2]) for pose in poses if abs(pose.lean) > STEEP]
-        # 1.5: ratio of their farthest to their nearest distance: it separates height from pitch
+        # 1.5: ratio of their maximum to their minimum distance, which separates height from pitch
         if not found and max(distances) < 1.5 * min(distances):
-            found.append(f"it so at more distances, not only {min(distances):.2f} to {max(distances):.2f} m")
+            found.append(f"these tilts at more distances than {min(distances):.2f} to {max(distances):.2f} m")
         return found
 
     @staticmethod
@@ -214,25 +214,31 @@ class BoardGuide:
         return (1.0, 1.0) if not left else (len(self.views), len(self.views) + left)
 
     def trouble(self) -> str:
-        """Describe why no new view was accepted, in a sentence."""
+        """Return one sentence with the reason why no new view was accepted."""
         a, board = self.attempts, self.reader.board
         shape = f"{board.columns} x {board.rows} squares"
         within = f"in {self.patience:g} s"
         if a.damaged > 0.5 * a.pictures:
-            return f"{a.damaged} of {a.pictures} pictures cannot be decoded: look at the camera's cable and hub"
+            return f"{a.damaged} of {a.pictures} images cannot be decoded: check the camera's cable and hub"
         if a.unseen > 0.8 * a.pictures:
             strangers = sorted(self.reader.strangers)
             if strangers:
-                return f"another board is shown: marker {strangers[0]} is none of {shape}; state --columns and --rows"
-            return f"no board of {shape} is seen {within} ({a.pictures} pictures): print one (`stand print`), light it"
+                return (
+                    f"the image shows another board: marker {strangers[0]} does not belong to {shape}; state "
+                    "--columns and --rows"
+                )
+            return (
+                f"no board of {shape} was detected {within} ({a.pictures} images): print one (`stand print`) "
+                "and light it"
+            )
         if a.blurred > 0.4 * a.pictures:
             return (
-                f"the pictures are blurred (edges of {a.blur:.1f} pixels, expected {BLURRED:g}): more light, a clean "
-                "and focused lens, a still hand"
+                f"the images are blurred (edges {a.blur:.1f} pixels wide, expected {BLURRED:g}): use more "
+                "light, clean and focus the lens, hold the board still"
             )
         if a.moved > 0.3 * a.pictures:
             return f"the board was never held still for {HOLD / SECOND:g} s {within}"
-        return f"nothing new {within}; still missing: {'; '.join(self.missing())}"
+        return f"no new view {within}; still missing: {'; '.join(self.missing())}"
 
 
 def apart(one: BoardSighting, other: BoardSighting) -> Array:
@@ -248,7 +254,7 @@ def moved(one: BoardSighting, other: BoardSighting) -> float:
 
 
 def averaged(sightings: Sequence[BoardSighting]) -> BoardSighting:
-    """Means of the corners that most sightings share."""
+    """Mean corners over the sightings, for corners found in most of them."""
     ids = np.concatenate([s.ids for s in sightings])
     corners = np.concatenate([s.corners for s in sightings])
     numbers, counts = np.unique(ids, return_counts=True)

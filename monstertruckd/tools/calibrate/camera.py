@@ -32,7 +32,10 @@ from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, estimated
 from monstertruckd.tools.calibrate.steps import Collect, Confirm, Plot, WatchStep
 from monstertruckd.tools.calibrate.wizard import WizardContext
 
-ROOM: Final = "a printed board on something flat (`stand print`), 0.4 to 1 m before the camera; light; nothing drives"
+ROOM: Final = (
+    "a printed board on a flat plate (`stand print`), held 0.4 to 1 m from the camera in good light; the "
+    "robot does not drive"
+)
 FIRST: Final = 3
 """Number of images that determine the image size."""
 KEPT: Final = math.radians(0.7)
@@ -40,7 +43,9 @@ KEPT: Final = math.radians(0.7)
 UNITS: Final = {"focal_x": "px", "focal_y": "px", "centre_x": "px", "centre_y": "px"}
 
 _BOARD: Final = Confirm(
-    "board", "Hold the board before the camera, each way for a second, tilted to all sides, over the whole picture. Go?"
+    "board",
+    "Hold the board in front of the camera for a second in each pose: tilted in all directions, across "
+    "the whole image. Start?",
 )
 
 
@@ -49,7 +54,7 @@ class CameraWizard:
     """Collects images and scans of a board until they suffice."""
 
     name: ClassVar[WizardName] = "camera"
-    doc: ClassVar[str] = "lens of the camera, and where it sits against the lidar, from a board held before both"
+    doc: ClassVar[str] = "camera lens, and camera pose relative to the lidar, from a board held in front of both"
     room: ClassVar[str] = ROOM
     board: BoardConfig = field(default_factory=BoardConfig)
     lidar: bool = True
@@ -59,13 +64,13 @@ class CameraWizard:
 
     @classmethod
     def of(cls, columns: int, rows: int, square: float, marker: float, lens_only: bool, patience: float) -> Self:
-        """Create from the command's options; lengths in m.
+        """Create it from the command's options; lengths in m.
 
         Raises:
-            InputError: a marker does not lie in its square.
+            InputError: a marker is larger than its square.
         """
         if marker >= square:
-            text = f"expected less than --square {1000 * square:g}, the square around it"
+            text = f"expected less than --square {1000 * square:g}, the square around the marker"
             raise InputError(f"--marker {1000 * marker:g}: {text}")
         return cls(BoardConfig(columns=columns, rows=rows, square=square, marker=marker), not lens_only, patience)
 
@@ -73,11 +78,13 @@ class CameraWizard:
         """Measure."""
         device = context.config.devices.camera
         if device is None or not isinstance(believed := getattr(device.driver, "lens", None), LensConfig):
-            raise RequestRefusedError(Reason.NOT_SUPPORTED, "this robot has no camera whose lens it states")
+            raise RequestRefusedError(
+                Reason.NOT_SUPPORTED, "this robot has no camera whose driver takes lens parameters"
+            )
         first = await context.collect(Collect("a picture", topics.CAMERA, FIRST))
         shapes = [picture.shape for message in first if (picture := decoded(message)) is not None]
         if not shapes:
-            raise InputError(f"none of {FIRST} pictures of the camera can be decoded: look at its cable and hub")
+            raise InputError(f"none of {FIRST} images of the camera can be decoded: check its cable and hub")
         height, width = shape = shapes[0]
         reader, lens = BoardReader(self.board), Lens.of(believed, width, height)
         mount = np.array([getattr(device.mount, name) for name in NAMES])
@@ -93,7 +100,7 @@ class CameraWizard:
             scans, picture = others.get(topics.SCAN.name, []), decoded(message)
             if picture is not None and picture.shape != shape:
                 now = " x ".join(map(str, picture.shape[::-1]))
-                raise InputError(f"the camera's pictures were {width} x {height} pixels and are {now} now: start again")
+                raise InputError(f"the image size changed from {width} x {height} to {now} pixels: start again")
             sighting = None if picture is None else reader.read(picture)
             if guide.take(message.stamp, sighting, scans, damaged=picture is None) is not None:
                 corners = np.vstack([view.sighting.corners for view in guide.views]) * (1.0, -1.0)
@@ -130,7 +137,9 @@ def decoded(message: CompressedImage) -> Picture | None:
 
 
 def check_kept(before: LidarPlace, after: LidarPlace | None) -> None:
-    """Refuse views whose lidar joints have turned during the run: the truck was leant on, or its ground gave way.
+    """Refuse the views if the lidar's joints turned during the run.
+
+    The operator leant on the truck, or the ground gave way.
 
     Raises:
         InputError: the joints have turned.
@@ -138,16 +147,16 @@ def check_kept(before: LidarPlace, after: LidarPlace | None) -> None:
     turn = 0.0 if after is None else float(np.linalg.norm(cv2.Rodrigues(before.axes.T @ after.axes)[0]))
     if turn > KEPT:
         raise InputError(
-            f"the lidar has turned by {math.degrees(turn):.1f} degrees on its stabiliser meanwhile: stand the robot "
-            "firmly, do not lean on it, and start again"
+            f"the stabiliser turned the lidar by {math.degrees(turn):.1f} degrees during the measurement: "
+            "place the robot firmly, do not lean on it, and start again"
         )
 
 
 def lens_of(views: Sequence[BoardView], reader: BoardReader, size: tuple[int, int]) -> tuple[LensFit, list[BoardView]]:
-    """Fit the lens; return it with the views used. Views with corners far off are dropped.
+    """Fit the lens; return it with the views used. Views with large corner errors are dropped.
 
     Raises:
-        InputError: no lens explains the corners.
+        InputError: no lens fits the corners.
     """
     found = fit_lens([view.sighting for view in views], reader, size)
     kept = list(views)
@@ -159,8 +168,8 @@ def lens_of(views: Sequence[BoardView], reader: BoardReader, size: tuple[int, in
     worst = 1.0  # maximum RMS corner error (px)
     if found.rms > worst:
         raise InputError(
-            f"corners are off by {found.rms:.1f} pixels (expected {worst:g} at most): the board is not flat, it "
-            "moved, or a pinhole with radial distortion does not describe the lens"
+            f"corners deviate by {found.rms:.1f} pixels (expected {worst:g} at most): the board is bent, "
+            "it moved, or the lens does not follow the pinhole model with radial distortion"
         )
     return found, kept
 
@@ -202,7 +211,9 @@ def mount_of(
     fit, lines = fit_mount(views, reader, found.lens, mount, lidar, focal)
     halves = known_errors(fit, 2 * len(lines) - len(NAMES))
     if not np.isfinite(halves).all():
-        raise InputError("mount not determined by the views: it is more than half a metre off, or never tilted")
+        raise InputError(
+            "the views do not determine the mount: it is more than half a metre off, or the board was never tilted"
+        )
     # The lens axis is known as accurately as its centre in the image.
     axis = {"yaw": NORMAL * found.sigmas[2] / fx, "pitch": NORMAL * found.sigmas[3] / fy}
     values = {
@@ -222,35 +233,39 @@ def lidar_halves(context: WizardContext) -> dict[str, float]:
 def result_of(found: LensFit, views: int, placed: PlacedMount | None = None) -> Result:
     """Assemble the result; without ``placed`` for the lens alone."""
     lens, (width, height) = found.lens, found.lens.size
-    sized = "size of the pictures that the lens describes"
+    sized = "image size that the lens parameters apply to"
     estimates = [
         Estimate(name=name, value=value, unit="px", samples=views, meaning=sized, key=f"{CAMERA_LENS}.{name}")
         for name, value in (("width", width), ("height", height))
     ]
     for name, value, sigma in zip(PARAMETERS, lens.parameters.tolist(), found.sigmas.tolist(), strict=True):
         interval = Interval(value, NORMAL * sigma)
-        text = "of Brown's lens; 95 % of the corners"
+        text = "Brown's lens model; 95 % interval of the corners"
         key = f"{CAMERA_LENS}.{name}"
         estimates.append(estimated(name, interval, UNITS.get(name, ""), found.corners, text, key))
-    zero = "sixth order of the radial distortion, not fitted"
+    zero = "sixth-order radial distortion, not fitted"
     estimates.append(Estimate(name="k3", value=0.0, samples=views, meaning=zero, key=f"{CAMERA_LENS}.k3"))
     if placed is not None:
-        noise = "95 % of line and plane, lens and print, and of the lidar's mount where it was calibrated"
+        noise = "95 % interval from line and plane, lens and print, and the lidar's mount where it was calibrated"
         for name, interval in placed.values.items():
             unit = "m" if name in ("x", "y", "z") else "rad"
-            text = f"of the camera on the body, from the lidar's mount; {noise}"
+            text = f"of the camera on the body, relative to the lidar's mount; {noise}"
             estimates.append(estimated(name, interval, unit, placed.lines, text, f"{CAMERA_MOUNT}.{name}"))
-        text = "scale of the board relative to the stated size, by lidar and ruler; for information"
+        text = "scale of the board relative to the stated size, from lidar and ruler; for information"
         estimates.append(estimated("board_size", placed.size, "", placed.lines, text))
     crossed = "" if placed is None else f", {placed.lines} across the lidar's beam"
     return Result(
         wizard="camera",
-        measured=f"{views} views of a board{crossed}; corners off by {found.rms:.2f} pixels",
+        measured=f"{views} views of a board{crossed}; corner residual {found.rms:.2f} pixels",
         estimates=tuple(estimates),
         unobserved=(
-            "a board that is bent: its corners fit a wrong lens",
-            *(("the mount: measured with the lidar only",) if placed is None else ()),
-            *(("height and tilt of the lidar itself: the camera's are against them",) if placed is not None else ()),
+            "a bent board: its corners yield a wrong lens",
+            *(("the mount: it is measured only together with the lidar",) if placed is None else ()),
+            *(
+                ("height and tilt of the lidar itself: the camera's values are relative to them",)
+                if placed is not None
+                else ()
+            ),
         ),
         partial=placed is None,
     )

@@ -1,8 +1,8 @@
 """Hard and soft iron of the compass from circles driven on level ground.
 
-On level ground the horizontal field of a truck that turns once traces a circle; its iron shifts it (hard iron) and
-makes it an ellipse (soft iron). A flat circle shows no more than that ellipse: neither the vertical iron, nor the
-strength of the field, nor a rotation of the whole (the unit's mounting).
+On level ground the horizontal magnetic field of a turning truck traces a circle. The truck's iron shifts the circle
+(hard iron) and deforms it to an ellipse (soft iron). A level circle determines only this ellipse: not the vertical
+iron, the field strength, or the rotation of the mounted compass.
 """
 
 import math
@@ -24,14 +24,14 @@ from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, correlati
 from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep, Plot
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
-ROOM: Final = "2 m x 2 m, level, outdoors or well away from iron: no car, no reinforced wall, no drain within 3 m"
+ROOM: Final = "2 m x 2 m, level, outdoors or away from iron: no car, reinforced wall or drain within 3 m"
 
 TILT: Final = math.radians(0.5)
-"""Maximum error of the unit's tilt, rad (data sheet): through it the vertical field looks like hard iron."""
+"""Maximum tilt error of the compass, rad (data sheet): through it the vertical field looks like hard iron."""
 LINEARITY: Final = 0.001
-"""Relative nonlinearity of a magnetoresistive sensor over the earth's field, and so of the ellipse."""
+"""Relative nonlinearity of a magnetoresistive sensor over the earth's field, and of the ellipse."""
 GAP: Final = math.radians(30)
-"""Maximum gap between directions of the field in a circle."""
+"""Maximum gap between field directions in a circle."""
 
 _NAMES: Final = ("hard_x", "hard_y", "soft_xx", "soft_xy", "soft_yy")
 
@@ -47,14 +47,14 @@ class FieldCircle:
     roll: Array
     current: Array
     heading: Array
-    """Heading by the unit, or by the previous calibration; rad, clockwise."""
+    """Heading of the compass, or by the previous calibration; rad, clockwise."""
 
     @classmethod
     def of(cls, tracks: list[MoveRecord]) -> "FieldCircle":
-        """Readings while the truck moved, including those the driver flags as disturbed, because they show the iron.
+        """Select readings while the truck moved, including those that the driver flags as disturbed.
 
         Raises:
-            InputError: the compass sends no field, or too few readings.
+            InputError: the compass sends no field or too few readings.
         """
         rows = []
         for track in tracks:
@@ -70,11 +70,11 @@ class FieldCircle:
                 rows.append((field.x, field.y, field.z, a.pitch, a.roll, current, a.heading))
         if not rows:
             raise InputError(
-                "the compass sends no magnetic field: its field mask needs 64 (devices.compass.driver.fields)"
+                "the compass sends no magnetic field: set bit 64 of its field mask (devices.compass.driver.fields)"
             )
-        fewest = 24  # readings: one in 30 degrees of both circles
+        fewest = 24  # minimum number of readings: one per 30 degrees of both circles
         if len(rows) < fewest:
-            raise InputError(f"{len(rows)} readings of the compass while the robot moved: expected {fewest} or more")
+            raise InputError(f"the compass sent {len(rows)} readings while the robot moved: expected {fewest} or more")
         return cls(*np.array(rows).T)
 
     def plot(self, iron: IronConfig | None = None) -> Plot:
@@ -91,25 +91,27 @@ class FieldCircle:
 
 @dataclass(frozen=True, slots=True)
 class CompassWizard:
-    """One circle forward, the same one back: the effect of the motor's current changes its sign with the direction."""
+    """One circle forward and one back: the effect of the motor current changes its sign with the direction."""
 
     name: ClassVar[WizardName] = "compass"
-    doc: ClassVar[str] = "the robot's own magnetism, from a driven circle"
+    doc: ClassVar[str] = "magnetism of the robot, from a driven circle"
     room: ClassVar[str] = ROOM
     speed: float = 0.07
-    """m/s: slowly, for a compass with much iron runs ahead and falls behind by turns, which the gate takes for
-    wheels that do not steer"""
+    """m/s: slow, because the heading of a compass near much iron leads and lags, which the gate would take for steering
+    that does not follow
+    """
 
     async def __call__(self, context: WizardContext) -> Result:
         """Measure."""
         context.value("devices.compass.driver.rate")
         context.say(
-            "Motor and computer on, everything mounted as it will drive; phones and keys away from the compass."
+            "Switch on motor and computer and mount everything as for driving; keep phones and keys away "
+            "from the compass."
         )
         await context.confirm(CLEAR)
         angle = 0.35  # angle of both axles, in opposite directions, rad: a circle of 0.44 m
         length = 2 * math.pi / context.chassis.bicycle.curvature(angle, -angle)
-        full = 2 * math.pi * 1.05  # turns to be driven
+        full = 2 * math.pi * 1.05  # number of turns
         tracks = [
             await context.move(
                 MoveStep(
@@ -122,7 +124,7 @@ class CompassWizard:
                     also=(topics.COMPASS,),
                 )
             )
-            for name, speed in (("a circle to the left", self.speed), ("the same circle back", -self.speed))
+            for name, speed in (("a circle to the left", self.speed), ("the same circle backwards", -self.speed))
         ]
         circle = FieldCircle.of(tracks)
         context.plot(circle.plot())
@@ -132,37 +134,44 @@ class CompassWizard:
 
 
 def result_of(circle: FieldCircle) -> Result:
-    """Fit and evaluate.
+    """Fit the ellipse and check it.
 
     Raises:
-        InputError: no full circle was driven, the field turns the wrong way round, or is not an ellipse.
+        InputError: the circle is incomplete, the field turns in the wrong direction, or it is not an ellipse.
     """
     if np.ptp(circle.heading) == 0.0:
-        raise InputError("the unit's heading stays the same while the robot turns: unplug the compass, and plug it in")
+        raise InputError(
+            "the compass heading stays constant while the robot turns: unplug the compass and plug it in again"
+        )
     fit = fit_ellipse(circle)
     iron = IronConfig(**dict(zip(_NAMES, _iron(fit.parameters), strict=True)))
     angle = _angles(circle, iron)
     _check_coverage(angle)
     if np.corrcoef(np.diff(np.unwrap(angle)), np.diff(np.unwrap(circle.heading)))[0, 1] < 0:
         raise InputError(
-            "the field turns against the unit's own heading: its axes are not x forward, y left; mount it otherwise "
-            "(setting E of the unit)"
+            "the field turns opposite to the compass heading: its axes are not x forward, y left; change "
+            "its mounting setting (E)"
         )
     radius = float(fit.parameters[4])
-    # 0.03: maximum residual of an ellipse, as a fraction of the circle's radius: headings would err by 2 degrees
+    # 0.03: maximum residual of an ellipse, as a fraction of the circle's radius: it corresponds to a heading error of 2
+    # degrees
     if not np.isfinite(fit.standard_errors[:5]).all() or fit.rms > 0.03 * radius:
         raise InputError(
-            f"the field is {fit.rms:.1f} uT off the ellipse of {radius:.0f} uT that the robot's own iron can make of "
-            "it: a magnet is near the compass, or iron in the ground or passing by; go elsewhere, or move the compass"
+            f"the field deviates by {fit.rms:.1f} uT from the {radius:.0f} uT ellipse that the robot's "
+            "iron can cause: a magnet near the compass, or iron in the ground or passing by, disturbs "
+            "it; calibrate elsewhere or move the compass"
         )
     errors = NORMAL * correlation_factor(fit.residuals) * _iron_errors(fit)
     vertical = float(np.abs(circle.z).mean()) * math.sin(TILT)
-    # 3.0: by how many times what ``lasting`` finds, iron in the ground, the ellipse may be off: of bumps that were
-    # drawn at random, 0.3 to 4 microtesla high, 96 % put its middle off by less, and 93 % its shape
+    # 3.0: bound of the ellipse's error as a multiple of the result of ``lasting``, iron in the ground: of random bumps
+    # from 0.3 to 4 microtesla, 96 % shift its middle by less, and 93 % its shape
     ground = 3.0 * lasting(fit.residuals)
     bounds = [vertical + ground if name.startswith("hard") else LINEARITY + ground / radius for name in _NAMES]
     taken_out = np.degrees(np.abs(wrap(circle.heading - angle - mean_angle(circle.heading - angle))).max())
-    tilt = f"95 % of the readings' noise, {math.degrees(TILT):g} deg of the unit's tilt error, and iron in the ground"
+    tilt = (
+        f"95 % interval from the noise of the readings, {math.degrees(TILT):g} deg of tilt error of the "
+        "compass, and iron in the ground"
+    )
     estimates = [
         Estimate(
             name=name,
@@ -171,10 +180,10 @@ def result_of(circle: FieldCircle) -> Result:
             high=value + error + bound,
             unit="uT" if name.startswith("hard") else "",
             samples=circle.x.size,
-            meaning=f"hard iron, unit's own scale; {tilt}"
+            meaning=f"hard iron, in the scale of the compass; {tilt}"
             if name.startswith("hard")
-            else f"makes the ellipse a circle, determinant 1; 95 % of the readings' noise, {LINEARITY:.1%} of bend, "
-            "and iron in the ground",
+            else "turns the ellipse into a circle, determinant 1; 95 % interval from the noise of the "
+            f"readings, {LINEARITY:.1%} of nonlinearity, and iron in the ground",
             key=f"{COMPASS}.{name}",
         )
         for name, value, error, bound in zip(_NAMES, _iron(fit.parameters), errors, bounds, strict=True)
@@ -186,25 +195,25 @@ def result_of(circle: FieldCircle) -> Result:
             value=float(taken_out),
             unit="deg",
             samples=circle.x.size,
-            meaning="greatest change of the heading by this calibration, a constant turn left aside",
+            meaning="maximum change of the heading by this calibration, apart from a constant rotation",
         )
     )
     return Result(
         wizard="compass",
-        measured=f"{circle.x.size} readings on a flat circle driven forward and back; residual {fit.rms:.2f} uT",
+        measured=f"{circle.x.size} readings on a level circle driven forwards and backwards; residual {fit.rms:.2f} uT",
         estimates=tuple(estimates),
         unobserved=(
-            "hard and soft iron along z: on a slope the heading errs by up to (hard_z / horizontal field) x slope",
-            "the strength of the field: all values are in the unit's own scale",
-            "a rotation of the unit on the robot: a constant error of the heading",
+            "hard and soft iron along z: on a slope the heading error reaches (hard_z / horizontal field) x slope",
+            "the field strength: all values are in the scale of the compass",
+            "a rotation of the compass on the robot: it is a constant heading error",
         ),
     )
 
 
 def lasting(residuals: Array) -> float:
-    """RMS of the residuals' slow part, over an eighth of a circle, in the order of time; 0 for noise only.
+    """RMS of the slow part of the residuals, over an eighth of a circle, in the order of time; 0 for pure noise.
 
-    By means over so many readings, less what their noise leaves in them; up to twice that is treated as noise.
+    Computed from means over this number of readings, minus their noise; up to twice the noise is treated as noise.
     """
     window = max(residuals.size // 16, 1)
     means = np.convolve(residuals, np.ones(window) / window, "valid")
@@ -213,7 +222,7 @@ def lasting(residuals: Array) -> float:
 
 
 def _motor(circle: FieldCircle, fit: FitResult) -> list[Estimate]:
-    """Effect of an ampere of motor current on the field, and its maximum effect on the heading."""
+    """Field per ampere of motor current, and its maximum effect on the heading."""
     if not np.isfinite(fit.standard_errors[5:]).all():
         return []
     halves = NORMAL * correlation_factor(fit.residuals) * fit.standard_errors[5:]
@@ -227,18 +236,20 @@ def _motor(circle: FieldCircle, fit: FitResult) -> list[Estimate]:
         high=math.degrees((amount + math.hypot(*halves)) / radius),
         unit="deg/A",
         samples=circle.x.size,
-        meaning="greatest turn of the heading by an ampere of motor current, across the disturbance; for information",
+        meaning="maximum heading change per ampere of motor current, across the disturbance; for information",
     )
-    meaning = "field of an ampere of motor current, forward positive; 95 % of the readings' noise"
+    meaning = (
+        "magnetic field per ampere of motor current, forward positive; 95 % interval from the noise of the readings"
+    )
     fields = (estimated(name, Interval(value, half), "uT/A", circle.x.size, meaning) for name, value, half in found)
     return [*fields, turn]
 
 
 def fit_ellipse(circle: FieldCircle) -> FitResult:
-    """Least-squares fit of the levelled field's length; parameters hard_x, hard_y, u, v, radius, motor_x, motor_y.
+    """Fit the length of the levelled field by least squares; parameters hard_x, hard_y, u, v, radius, motor_x, motor_y.
 
-    ``soft`` is [[e^u w, v], [v, w e^-u]] with w^2 = 1 + v^2: symmetric, determinant 1. ``motor`` is the field of the
-    motor's current, uT/A.
+    ``soft`` is [[e^u w, v], [v, w e^-u]] with w^2 = 1 + v^2: symmetric, determinant 1. ``motor`` is the field per motor
+    current, uT/A.
     """
     middle = np.array([(values.max() + values.min()) / 2 for values in (circle.x, circle.y)])
     radius = max(float(np.ptp(circle.x)), float(np.ptp(circle.y)), 1.0) / 2
@@ -264,7 +275,7 @@ def _iron(parameters: Array) -> tuple[float, ...]:
 
 
 def _iron_errors(fit: FitResult) -> Array:
-    """Standard errors in the order of ``_NAMES``, by the slopes of ``_iron`` (u and v hardly correlate)."""
+    """Standard errors in the order of ``_NAMES``, from the derivatives of ``_iron``."""
     point, errors = fit.parameters[:4], fit.standard_errors[:4]
     step = 1e-6
     slopes = np.array(
@@ -274,7 +285,7 @@ def _iron_errors(fit: FitResult) -> Array:
 
 
 def _angles(circle: FieldCircle, iron: IronConfig) -> Array:
-    """Headings by the field with ``iron`` taken out, rad."""
+    """Headings from the field corrected by ``iron``, rad."""
     forward, left = level_field((circle.x, circle.y, circle.z), circle.pitch, circle.roll, iron)
     return np.asarray(np.arctan2(left, forward))
 
@@ -284,6 +295,6 @@ def _check_coverage(angles: Array) -> None:
     gap = float(max(np.diff(around).max(), around[0] + 2 * math.pi - around[-1]))
     if gap > GAP:
         raise InputError(
-            f"the robot has not turned all the way round: {math.degrees(gap):.0f} deg of the circle are missing; "
-            "calibrate the steering's directions first"
+            f"the robot did not complete the circle: {math.degrees(gap):.0f} deg are missing; calibrate "
+            "the steering's directions first"
         )

@@ -1,10 +1,10 @@
-"""Sign and ratio of the drive from taped distances, and how late its motor follows.
+"""Sign and ratio of the drive from taped distances, and the response delay of its motor.
 
-Only turns of the motor per metre over the floor can be seen: gear ratio and wheel radius never show apart. So the
-radius stays as configured, and the ratio is the one that makes the odometer right with it.
+Only motor turns per metre of floor can be measured: gear ratio and wheel radius cannot be separated. So the wizard
+keeps the configured radius and fits the ratio.
 
-Dead time and lag follow from the gate's commands and the motor's turns. Starting and stopping are separate: drivers
-pass on a slower speed at once, a faster one with their next cycle.
+Dead time and lag are fitted to the gate's commands and the motor's turns. Start and stop are fitted separately, because
+drivers forward a lower speed at once and a higher one in their next cycle.
 """
 
 import math
@@ -27,47 +27,49 @@ from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 RATIO: Final = "geometry.drive_ratio"
 INVERTED: Final = "devices.drive.driver.inverted"
 RATE: Final = "devices.drive.driver.rate"
-ROOM: Final = "a straight of 3 m (half a metre of it behind the robot), 1 m wide, level"
+ROOM: Final = "a straight of 3 m (0.5 m of it behind the robot), 1 m wide, level"
 
 BENT: Final = 0.35
-"""Turn in one run, rad, beyond which a straight tape measures nothing useful."""
+"""Maximum turn in one run, rad: a tape measures a straight distance."""
 ASIDE: Final = math.tan(BENT / 2)
-"""How far aside of straight ahead such a run ends, per metre of the tape."""
+"""Maximum lateral deviation of such a run, per metre of the tape."""
 
-_FORWARD: Final = Confirm("forward", "Did the robot roll FORWARD, lidar first?", fact=True)
-_MARK: Final = Confirm("mark", "Mark the floor straight below the middle of the front bumper. Done?")
+_FORWARD: Final = Confirm("forward", "Did the robot roll FORWARD, in the direction the lidar faces?", fact=True)
+_MARK: Final = Confirm("mark", "Mark the floor vertically below the middle of the front bumper. Done?")
 _DISTANCE: Final = Number(
-    "distance", "Distance from that mark to below the middle of the front bumper now, m", 0.2, 20.0
+    "distance", "Distance from that mark to the point below the middle of the front bumper now, m", 0.2, 20.0
 )
 _STRAIGHT: Final = Confirm(
-    "straight", f"Is it less than {100 * ASIDE:.0f} cm per metre aside of straight ahead of the mark?", fact=True
+    "straight",
+    f"Did the robot end less than {100 * ASIDE:.0f} cm per metre left or right of straight ahead?",
+    fact=True,
 )
-"""Asked of a truck without a compass."""
+"""Question for a truck without a compass."""
 
 
 @dataclass(frozen=True, slots=True)
 class DriveWizard:
-    """Sign, then several runs forward and back."""
+    """Wizard: the sign, then several runs forward and back."""
 
     name: ClassVar[WizardName] = "drive"
-    doc: ClassVar[str] = "which way is forward, the distance per motor turn, from taped distances; how late it follows"
+    doc: ClassVar[str] = "forward direction, motor turns per metre from taped distances, and response delay"
     room: ClassVar[str] = ROOM
     runs: int = 4
-    """Taped distances; at least 3"""
+    """Number of taped runs; at least 3"""
     metres: float = 2.0
-    """Length of a run"""
+    """Length of a run, m"""
     tape_error: float = 0.002
-    """Standard deviation of one reading of the tape, m; a run has two, at its mark and at its end"""
+    """Standard deviation of one tape reading, m; a run has two, at its mark and at its end"""
     speed: float = 0.15
 
     sign_only: bool = False
-    """End once it is clear where forward is"""
+    """Stop once the forward direction is known"""
 
     async def __call__(self, context: WizardContext) -> Result:
         """Measure."""
         inverted = bool(context.value(INVERTED))
         await context.confirm(CLEAR)
-        sign = await context.move(MoveStep("a hand's breadth, to see where forward is", 0.06, metres=0.15))
+        sign = await context.move(MoveStep("10 cm, to see which direction is forward", 0.06, metres=0.15))
         if not await context.confirm(_FORWARD):
             return self._reversed(inverted)
         if self.sign_only:
@@ -79,9 +81,11 @@ class DriveWizard:
             )
         compass = context.config.devices.compass is not None
         if compass:
-            sign.turn()  # before anything is taped
+            sign.turn()  # before any taped run
         else:
-            context.say("no compass: how straight the runs are is judged by eye, and the result is less certain")
+            context.say(
+                "no compass: the operator judges by eye whether the runs are straight, and the result is less certain"
+            )
         runs, tracks = [], []
         for run in range(self.runs):
             await context.confirm(_MARK)
@@ -104,37 +108,38 @@ class DriveWizard:
             wizard="drive",
             measured="the robot was commanded forward and rolled backward",
             estimates=(_sign(not inverted),),
-            unobserved=("the ratio: nothing is driven any further with the sign wrong",),
+            unobserved=("the ratio: no run is driven while the sign is wrong",),
             partial=True,
-            again="restart the daemon, so that forward is forward, and calibrate the ratio",
+            again="restart the daemon so that forward is forward, then calibrate the ratio",
         )
 
     def _result(self, context: WizardContext, inverted: bool, runs: list["TapedRun"]) -> Result:
         values = [run.turns / run.length for run in runs]
         middle = float(np.median(values))
         for number, value in enumerate(values, start=1):
-            # 0.03: maximum relative difference of two runs before one of them must be a slip of the pen
+            # 0.03: maximum relative difference of two runs; a larger one indicates a wrong reading
             if abs(value / middle - 1) > 0.03:
                 off = 100 * (value / middle - 1)
-                raise InputError(f"run {number} differs by {off:.1f} % from the others: measure again")
-        # A compass disturbed by iron shows that there is a bend, not how much.
+                raise InputError(f"run {number} differs from the others by {off:.1f} %: measure again")
+        # A compass disturbed by iron shows that the run bends, but not how much.
         known = "compass" in context.known and context.config.devices.compass is not None
         bend = 0.0 if known else max(run.bend for run in runs)
         turns = turns_per_metre(values, self.tape_error, self.metres, bend)
         radius = float(context.value("geometry.wheel_radius"))
         ratio = turns.times(2 * math.pi * radius)
         floor = (
-            f"on this floor; 95 % of the runs' spread and of {1000 * self.tape_error:g} mm in each reading, "
-            f"{ASSUMED.tape_scale:.2%} of the tape" + (f", {bend:.2%} of the bends" if bend else "")
+            f"on this floor; 95 % interval from the spread of the runs, {1000 * self.tape_error:g} mm per "
+            f"reading, and {ASSUMED.tape_scale:.2%} of the tape length"
+            + (f", and {bend:.2%} for curved runs" if bend else "")
         )
         wheels = (
-            f"motor turns per turn of wheels of {radius:g} m {floor}, {ASSUMED.floor_slip:.1%} of slip on another one"
+            f"motor turns per turn of wheels of {radius:g} m {floor}, {ASSUMED.floor_slip:.1%} of slip on other floors"
         )
         count = len(runs)
         estimates = [
             _sign(inverted),
             estimated("drive_ratio", on_any_floor(ratio), "", count, wheels, RATIO),
-            estimated("turns_per_metre", turns, "1/m", count, f"turns of the motor per metre {floor}"),
+            estimated("turns_per_metre", turns, "1/m", count, f"motor turns per metre {floor}"),
         ]
         drive = context.config.devices.drive
         pulses = None if drive is None else drive.driver.encoder_pulses_per_turn
@@ -143,24 +148,25 @@ class DriveWizard:
             estimates.append(estimated("ticks_per_metre", ticks, "1/m", count, f"encoder counts per metre {floor}"))
         return Result(
             wizard="drive",
-            measured=f"{count} runs of about {self.metres:g} m, forward and back in turn, measured with a tape",
+            measured=f"{count} runs of about {self.metres:g} m, alternately forwards and backwards, measured with "
+            "a tape",
             estimates=tuple(estimates),
             unobserved=(
-                "gear ratio and wheel radius apart from each other",
+                "gear ratio and wheel radius separately",
                 "slip on slopes and in curves",
-                "how much later than the motor the wheels turn",
+                "delay of the wheels behind the motor",
             ),
         )
 
 
 def turns_per_metre(values: Sequence[float], tape_error: float, metres: float, bend: float) -> Interval:
-    """Turns of the motor per metre on this floor.
+    """Compute the motor turns per metre on this floor.
 
     Args:
-        values: values of every run, 1/m.
+        values: value of every run, 1/m.
         tape_error: standard deviation of one reading of the tape, m.
-        metres: length of a run.
-        bend: maximum unseen crookedness of a run, as a fraction.
+        metres: length of a run, m.
+        bend: maximum unnoticed curvature of a run, as a fraction of its length.
     """
     middle = float(np.median(values))
     found = mean_interval(values, middle * math.sqrt(2) * tape_error / metres)
@@ -168,7 +174,7 @@ def turns_per_metre(values: Sequence[float], tape_error: float, metres: float, b
 
 
 def on_any_floor(found: Interval) -> Interval:
-    """Value found on one floor, for use on others."""
+    """Extend a value measured on one floor to other floors."""
     return found.joined(found.value * ASSUMED.floor_slip)
 
 
@@ -181,33 +187,34 @@ class TapedRun:
     length: float
     """Length of the arc, m."""
     bend: float
-    """Excess length of the arc over the tape, as a fraction."""
+    """Length of the arc relative to the tape, minus 1."""
 
     @classmethod
     def of(cls, track: MoveRecord, distance: float, *, straight: bool | None = None) -> "TapedRun":
-        """Distance along the arc from the taped chord, m.
+        """Compute the distance along the arc from the taped chord, m.
 
         Args:
-            track: the run.
-            distance: the chord, m.
-            straight: whether it looked straight, of a truck without a compass: half the greatest bend that looks so is
-                taken off, and may be too much or too little.
+            track: record of the run.
+            distance: length of the chord, m.
+            straight: for a truck without a compass, whether the run looked straight to the operator: half of the
+                maximum unnoticed bend is subtracted.
 
         Raises:
-            InputError: the truck went too crooked.
+            InputError: the truck turned too far.
         """
         if straight is None:
             turn, _ = track.turn()
             if abs(turn) > BENT:
                 raise InputError(
-                    f"the robot turned by {math.degrees(turn):.0f} deg on its way: "
-                    "run `calibrate steering --rough` first"
+                    f"the robot turned by {math.degrees(turn):.0f} deg during the run: run `calibrate "
+                    "steering --rough` first"
                 )
             length = arc(distance, turn)
         elif not straight:
             raise InputError(
-                f"the robot turned by more than {math.degrees(BENT):.0f} deg on its way: set the middle of its servos "
-                "(devices.steering.driver.front.centre_us, .rear.centre_us), for `calibrate steering` needs a compass"
+                f"the robot turned by more than {math.degrees(BENT):.0f} deg during the run: set the "
+                "centre of its servos by hand (devices.steering.driver.front.centre_us, "
+                ".rear.centre_us), because `calibrate steering` needs a compass"
             )
         else:
             length = (distance + arc(distance, BENT)) / 2
@@ -215,7 +222,7 @@ class TapedRun:
 
 
 def arc(chord: float, turn: float) -> float:
-    """Length of a circular arc, m, from its chord and its angle, rad."""
+    """Length of a circular arc, m, from its chord (m) and its angle (rad)."""
     half = turn / 2
     return chord * half / math.sin(half) if half else chord
 
@@ -225,23 +232,22 @@ def _sign(inverted: bool) -> Estimate:
         name="inverted",
         value=inverted,
         samples=1,
-        meaning="driving forward needs negative rpm of the controller; seen by the operator",
+        meaning="driving forward needs negative rpm of the controller; confirmed by the operator",
         key=INVERTED,
     )
 
 
 Part = Literal["start", "stop"]
 LEAST_POSITIONS: Final = 8
-"""Positions of a motor from rest to half the distance, or from there to rest, that dead time and lag have to rest
-on."""
+"""Minimum number of motor positions from rest to half the distance, or from there to rest, to fit dead time and lag."""
 
 
 @dataclass(frozen=True, slots=True)
 class HalfRun:
-    """A run from rest to the middle of its distance, or from there to rest."""
+    """First or second half of a run: from rest to half the distance, or from there to rest."""
 
     speed: Steps
-    """Commanded, rad/s of the motor."""
+    """Commanded motor speed, rad/s."""
     times: Array
     """Times of the positions, s; (n,)."""
     positions: Array
@@ -249,7 +255,7 @@ class HalfRun:
 
     @classmethod
     def of(cls, record: MoveRecord, part: Part) -> Self | None:
-        """None where there is too little of it."""
+        """Extract it from a record; None if it contains too few positions."""
         if not record.drive_commands:
             return None
         times = np.array([reading.stamp for reading in record.drive]) / SECOND
@@ -262,25 +268,25 @@ class HalfRun:
         return cls(Steps.of(sent[:, 0], sent[:, 1]), times[kept], positions[kept])
 
     def residuals(self, delay: float, squared: float) -> Array:
-        """Positions that remain unexplained, rad, whatever gain and origin are; arguments as ``Steps.integral``."""
+        """Residuals of the positions for the best gain and origin, rad; arguments as for ``Steps.integral``."""
         due = self.speed.integral(self.times, delay, squared)
         return unexplained(self.positions - self.positions[0], due, np.ones_like(due))
 
 
 def drive_response(records: Iterable[MoveRecord], part: Part, cycle: float) -> ResponseFit:
-    """How the motor follows the gate's commands.
+    """Fit the response of the motor to the gate's commands.
 
     Args:
-        records: straight runs, rests included.
-        part: which half of them.
-        cycle: seconds between two looks of the driver at its commands.
+        records: straight runs, including the rests.
+        part: first or second half of the runs.
+        cycle: period at which the driver reads its commands, s.
 
     Raises:
-        InputError: too little was read.
+        InputError: too few positions.
     """
     seen = [half for record in records if (half := HalfRun.of(record, part)) is not None]
     if not seen:
-        raise InputError(f"{part}: no run with {LEAST_POSITIONS} readings of the drive and the gate's commands")
+        raise InputError(f"{part}: no run has {LEAST_POSITIONS} readings of the drive and the gate's commands")
 
     def residuals(delay: float, squared: float) -> Array:
         return np.concatenate([half.residuals(delay, squared) for half in seen])
@@ -289,20 +295,20 @@ def drive_response(records: Iterable[MoveRecord], part: Part, cycle: float) -> R
 
 
 def drive_estimates(records: Iterable[MoveRecord], rate: float) -> list[Estimate]:
-    """Estimates of both parts, for information; ``rate`` is the rate of the driver's cycles, 1/s.
+    """Estimates for start and stop, for information; ``rate`` is the cycle rate of the driver, 1/s.
 
     Raises:
-        InputError: as ``drive_response``.
+        InputError: as for ``drive_response``.
     """
     runs, found = list(records), []
-    parts: tuple[tuple[Part, str], ...] = (("start", "setting off"), ("stop", "stopping"))
+    parts: tuple[tuple[Part, str], ...] = (("start", "starting"), ("stop", "stopping"))
     for part, what in parts:
         meanings = (
-            f"{what}: from a command to the first change of the motor's speed",
-            f"{what}: time constant of the motor's speed",
-            f"{what}: dead time and lag together; gate.reaction has to cover it, and wheels that follow later",
+            f"{what}: from a command to the first change of the motor speed",
+            f"{what}: time constant of the motor speed",
+            f"{what}: dead time plus lag; gate.reaction has to cover it and the additional delay of the wheels",
         )
-        covers = f"95 % of the runs' spread, and the driver's cycle of {1000 / rate:g} ms"
+        covers = f"95 % interval from the spread of the runs and the driver's cycle of {1000 / rate:g} ms"
         found += drive_response(runs, part, 1 / rate).estimates(meanings, covers, prefix=f"{part}_")
     return found
 

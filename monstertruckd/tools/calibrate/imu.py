@@ -22,10 +22,11 @@ from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
 ROOM: Final = "2 m x 2 m, level"
 ONE_G: Final = 9.80665
-"""m/s^2."""
+"""Standard gravity, m/s^2."""
 TILT: Final = math.radians(0.2)
 """Standard deviation of the compass's tilt, rad (data sheet: 0.5 degrees at most), and so of the direction of
-gravity."""
+gravity.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,14 +43,14 @@ class Turn:
 
     @classmethod
     def of(cls, record: MoveRecord, bias: float, scale: float) -> "Turn":
-        """Build it from a move; rates as published with a correction by ``bias`` (rad/s) and ``scale``.
+        """Create it from a move; rates are as published, corrected by ``bias`` (rad/s) and ``scale``.
 
         Raises:
-            InputError: no readings of the unit, or none for a while, or too few headings at rest.
+            InputError: no readings of the unit, a gap in them, or too few headings at rest.
         """
         readings = record.of(topics.IMU)
         if len(readings) < 2:
-            raise InputError("the inertial measurement unit sent nothing while the robot turned")
+            raise InputError("the inertial unit sent no data while the robot turned: check its cable")
         stamps = np.array([r.stamp for r in readings], dtype=np.float64) / SECOND
         rates = np.array([r.angular_velocity.z for r in readings]) / scale + bias
         turned, noise = record.turn()
@@ -57,9 +58,9 @@ class Turn:
         over = abs(math.remainder(turned, math.tau))
         between = (stamps >= record.left / SECOND - 0.2) & (stamps <= record.arrived / SECOND + 0.2)
         heard = np.concatenate(((record.left / SECOND,), stamps[between], (record.arrived / SECOND,)))
-        # 0.5: maximum gap between readings, s: the turn meanwhile is unknown
+        # 0.5: maximum gap between readings, s: the turn during a gap is unknown
         if (silent := float(np.diff(heard).max())) > 0.5:
-            raise InputError(f"the unit was silent for {silent:.1f} s while the robot turned: measure again")
+            raise InputError(f"the inertial unit was silent for {silent:.1f} s while the robot turned: measure again")
         integral = float(np.trapezoid(rates[between], stamps[between]))
         seconds = float(np.ptp(stamps[between]))
         return cls(integral, seconds, turned, math.hypot(noise, ASSUMED.turn_heading, 0.01 * min(over, 1.0)))
@@ -67,19 +68,19 @@ class Turn:
 
 @dataclass(frozen=True, slots=True)
 class ImuWizard:
-    """Measure at rest for ten seconds, then in full circles to both sides."""
+    """Wizard: ten seconds at rest, then full circles in both directions."""
 
     name: ClassVar[WizardName] = "imu"
     doc: ClassVar[str] = "biases of the inertial unit at rest, and the scale of its yaw rate from full turns"
     room: ClassVar[str] = ROOM
     rounds: int = 2
-    """Circles to each side"""
+    """Number of circles in each direction"""
     turns: bool = True
-    """Drive circles for the scale; otherwise biases only, and nothing moves"""
+    """Whether to drive circles for the scale; otherwise only biases are measured, at standstill"""
 
     @classmethod
     def of(cls, rounds: int, still: bool) -> Self:
-        """Build it from the command's options."""
+        """Create it from the command's options."""
         return cls(rounds, turns=not still)
 
     async def __call__(self, context: WizardContext) -> Result:
@@ -124,22 +125,22 @@ _NAMES: Final = ("rate_x", "rate_y", "rate_z", "rate_scale", "force_x", "force_y
 def result_of(
     resting: Sequence[Imu], tilt: Sequence[Attitude], turns: Sequence[Turn], before: dict[str, float]
 ) -> Result:
-    """Fit and evaluate.
+    """Compute the biases and the scale, and check them.
 
     Args:
-        resting: readings of the unit while the truck stands.
-        tilt: tilt of the truck meanwhile.
-        turns: between rests; none: the scale stays as it was.
-        before: correction that the daemon runs with, which is in ``resting``, by the names of the estimates.
+        resting: readings of the unit at rest.
+        tilt: tilt of the truck at rest.
+        turns: turns between rests; empty: the scale is kept.
+        before: correction already contained in ``resting``, by the names of the estimates.
 
     Raises:
         InputError: the unit was moved, or too few turns.
     """
     rates = np.array([(r.angular_velocity.x, r.angular_velocity.y, r.angular_velocity.z) for r in resting])
     rates = rates / (1.0, 1.0, before["rate_scale"]) + [before[f"rate_{axis}"] for axis in "xyz"]
-    # 0.02: greatest standard deviation of a resting yaw rate, rad/s: more is a unit that is being moved
+    # 0.02: maximum standard deviation of the yaw rate at rest, rad/s; above it the unit was moved
     if rates[:, 2].std() > 0.02:
-        raise InputError(f"the unit was moved: its yaw rate varies by {rates[:, 2].std():.3f} rad/s at rest")
+        raise InputError(f"the inertial unit was moved: its yaw rate at rest varies by {rates[:, 2].std():.3f} rad/s")
     forces = np.array([(r.linear_acceleration.x, r.linear_acceleration.y) for r in resting])
     forces += np.array((before["force_x"], before["force_y"]))
     pitch, roll = (float(np.mean([getattr(a, name) for a in tilt])) for name in ("pitch", "roll"))
@@ -153,7 +154,7 @@ def result_of(
             found,
             "rad/s" if name.startswith("rate") else "m/s^2",
             len(resting),
-            "bias of the angular velocity at rest; 95 % of the readings' noise"
+            "bias of the angular velocity at rest; 95 % interval from the noise of the readings"
             if name.startswith("rate")
             else "bias of the specific force; 95 % interval from the noise and the compass's tilt",
             f"{IMU}.{name}",
@@ -162,34 +163,34 @@ def result_of(
     ]
     if turns:
         scale = rate_scale(turns, biases["rate_z"])
-        meaning = "factor on the yaw rate, from full turns by the compass; 95 % of the turns' noise"
+        meaning = "factor on the yaw rate, from full turns by the compass; 95 % interval from the noise of the turns"
         estimates.append(estimated("rate_scale", scale, "", len(turns), meaning, f"{IMU}.rate_scale"))
     return Result(
         wizard="imu",
         measured=f"{len(resting)} readings at rest and {len(turns)} full turns",
         estimates=tuple(estimates),
         unobserved=(
-            "scales of pitch and roll rate",
-            "bias and scale of the vertical force, which only other orientations of the unit separate",
-            "what the temperature changes: bias drifts, and is followed at every rest",
+            "scales of roll and pitch rate",
+            "bias and scale of the vertical force, which only other orientations of the unit could separate",
+            "temperature effects: the bias drifts, and the estimator corrects it at every standstill",
         ),
         partial=not turns,
     )
 
 
 def rate_scale(turns: Sequence[Turn], bias: Interval) -> Interval:
-    """Factor that makes the integrated yaw rate the turn that the compass saw.
+    """Factor that makes the integrated yaw rate equal to the turn measured by the compass.
 
     Raises:
-        InputError: too few turns, or turns to one side only would let a bias look like a scale.
+        InputError: too few turns, or turns in one direction only, which cannot separate bias and scale.
     """
-    least = 2  # turns that determine the scale, at least
+    least = 2  # minimum number of turns
     if len(turns) < least or len({turn.turned > 0 for turn in turns}) < least:
-        raise InputError(f"{len(turns)} turns: expected at least one to each side")
+        raise InputError(f"{len(turns)} turns: expected at least one in each direction")
     rows = np.array([(t.integral, t.seconds, t.turned, t.sigma) for t in turns])
     integral, seconds, turned, sigma = rows.T
     if float((integral - bias.value * seconds) @ turned) < 0.0:
-        raise InputError("the yaw rate has the wrong sign: the unit lies upside down, or is mounted otherwise than set")
+        raise InputError("the yaw rate has the wrong sign: the unit is upside down, or its configured mount is wrong")
     drift = bias.half / NORMAL
 
     def residual(parameters: Array) -> Array:

@@ -1,6 +1,6 @@
 """Files of camera intrinsics: ``camera_info`` of ROS, camera chains of kalibr, matrices of OpenCV; pinhole and Brown.
 
-All count pixels from the middle of the first one, as ``LensConfig`` does.
+All formats count pixels from the centre of the first one, as ``LensConfig`` does.
 """
 
 import re
@@ -19,27 +19,27 @@ from monstertruckd.tools.calibrate.lens_forms import LensForm
 
 EXPECTED: Final = "camera intrinsics"
 _PINHOLE: Final = ("plumb_bob", "rational_polynomial", "radtan", "none", "")
-"""Names of the pinhole with Brown's distortion; a rational one has further terms, which must be 0."""
+"""Names of the pinhole model with Brown's distortion; the additional terms of a rational model must be 0."""
 _OPENCV: Final = (
     ("camera_matrix", "distortion_coefficients"),
     ("cameraMatrix", "distCoeffs"),
     ("K", "D"),
     ("M1", "D1"),
 )
-"""Names of matrix and coefficients in files of OpenCV and of its samples."""
+"""Names of matrix and coefficients in OpenCV's files and samples."""
 
 
 def lens_from(text: str, file: Path, *, camera: str | None = None, size: tuple[int, int] | None = None) -> LensConfig:
-    """Return the lens in a file's text.
+    """Parse the text of a lens file.
 
     Args:
         text: text of the file.
-        file: its name, for refusals.
-        camera: name in a chain of cameras; None: the only one.
-        size: width and height of the pictures (pixels), where the file does not state them.
+        file: file name, for error messages.
+        camera: camera name in a chain of cameras; None: the only one.
+        size: image width and height (pixels), if the file does not state them.
 
     Raises:
-        InputError: no such file, another model of lens, or numbers out of bounds; names the first mistake.
+        InputError: an unsupported lens model, or invalid numbers; the message names the first mistake.
     """
     data = _data(text, file)
     with reading(file, EXPECTED):
@@ -52,12 +52,12 @@ def lens_from(text: str, file: Path, *, camera: str | None = None, size: tuple[i
 
 
 def lens_text(lens: LensConfig, form: LensForm, name: str = "camera") -> str:
-    """Return a lens as a file's text.
+    """Format a lens as the text of a file.
 
     Args:
-        lens: what to write.
-        form: format of the file.
-        name: name of the camera.
+        lens: lens to write.
+        form: file format.
+        name: camera name.
     """
     focal = (lens.focal_x, lens.focal_y, lens.centre_x, lens.centre_y)
     matrix = [lens.focal_x, 0.0, lens.centre_x, 0.0, lens.focal_y, lens.centre_y, 0.0, 0.0, 1.0]
@@ -82,7 +82,7 @@ def lens_text(lens: LensConfig, form: LensForm, name: str = "camera") -> str:
             )
         case LensForm.KALIBR:
             if lens.k3:
-                raise InputError(f"k3 {lens.k3:g}: kalibr's radtan has k1, k2, p1 and p2 only")
+                raise InputError(f"k3 {lens.k3:g}: kalibr's radtan model has only k1, k2, p1 and p2")
             row = {"camera_model": "pinhole", "intrinsics": list(focal), "distortion_model": "radtan"}
             return yaml_text({"cam0": row | {"distortion_coeffs": brown[:4], "resolution": [lens.width, lens.height]}})
         case LensForm.OPENCV:
@@ -100,7 +100,7 @@ def _opencv(name: str, rows: int, columns: int, data: list[float]) -> str:
 
 
 def _data(text: str, file: Path) -> Mapping[str, Any]:
-    """The mapping in a file of YAML, or of OpenCV's dialect: its first line and tags are not YAML."""
+    """Mapping in a YAML file, or in OpenCV's dialect, whose first line and tags are not valid YAML."""
     plain = re.sub(r"!!opencv-matrix\b", "", re.sub(r"\A\ufeff?%YAML[^\n]*\n(---[^\n]*\n)?", "", text))
     documents = [part for part in plain.split("\n---") if part.strip("- \n")]
     with reading(file, EXPECTED):
@@ -116,7 +116,7 @@ def _data(text: str, file: Path) -> Mapping[str, Any]:
 
 def _chosen(chain: Mapping[str, Any], camera: str | None, file: Path) -> Mapping[str, Any]:
     if camera is None and len(chain) > 1:
-        raise InputError(f"{file}: has {', '.join(chain)}: expected --camera with one of them")
+        raise InputError(f"{file}: contains {', '.join(chain)}: choose one with --camera")
     if camera is not None and camera not in chain:
         raise InputError(f"{file}: no camera {camera}: expected one of {', '.join(chain)}")
     found: Mapping[str, Any] = chain[camera or next(iter(chain))]
@@ -135,7 +135,7 @@ def _kalibr(row: Mapping[str, Any], file: Path) -> LensConfig:
 def _matrices(
     data: Mapping[str, Any], matrix: str, coefficients: str, file: Path, size: tuple[int, int] | None
 ) -> LensConfig:
-    """Intrinsics of ROS or OpenCV: a matrix of nine numbers, and coefficients."""
+    """Intrinsics in the format of ROS or OpenCV: a matrix of nine numbers, and coefficients."""
     numbers = _floats(_numbers(data[matrix]), 9, matrix, file)
     fx, skew, cx, a, fy, cy, b, c, one = numbers
     if (skew, a, b, c, one) != (0.0, 0.0, 0.0, 0.0, 1.0):
@@ -164,7 +164,7 @@ def _lens(focal: Sequence[float], coefficients: Any, model: str, size: Any, file
     if np.any(brown[5:]):
         raise InputError(f"{file}: {len(brown)} distortion coefficients: expected k1, k2, p1, p2, k3 and zeros")
     if not isinstance(size, Sequence) or len(size) != 2 or None in size:
-        raise InputError(f"{file}: states no size of the pictures: expected --size WIDTHxHEIGHT")
+        raise InputError(f"{file}: contains no image size: state it with --size WIDTHxHEIGHT")
     k1, k2, p1, p2, k3 = (brown + [0.0] * 5)[:5]
     fx, fy, cx, cy = focal
     with reading(file, EXPECTED):

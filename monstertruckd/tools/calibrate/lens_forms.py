@@ -1,4 +1,4 @@
-"""Names of the file formats of camera intrinsics; light, for the command line."""
+"""Names of the file formats of camera intrinsics, without heavy imports, for the command line."""
 
 from enum import StrEnum
 

@@ -1,13 +1,13 @@
 """Mount of the lidar on the body, and the offset of its clock, from scans between rests.
 
-At two rests the lidar sees the same surroundings; how it moved between them follows from its scans alone, and how the
-body moved from wheels and steering. The mount transforms one into the other: X in A X = X B (Tsai and Lenz, "A New
-Technique for Fully Autonomous and Efficient 3D Robotics Hand/Eye Calibration", IEEE Transactions on Robotics and
-Automation, 1989), here in the plane. The turn is taken from the scans, which measure it best; so neither the compass
-nor an error of the steering counts, only the distance, whose scale is fitted too, and the direction of travel.
+The lidar sees the same surroundings at both rests. Registration of its scans gives the motion of the lidar; wheels and
+steering give the motion of the body. The mount X solves A X = X B (Tsai and Lenz, "A New Technique for Fully Autonomous
+and Efficient 3D Robotics Hand/Eye Calibration", IEEE Transactions on Robotics and Automation, 1989), here in the plane.
+The turn is taken from the scans, which measure it best. So errors of compass and steering have no effect; the fit
+depends on the distance, whose scale is fitted too, and on the direction of travel.
 
-How level it is follows from the height of its beam over the floor: near the lidar, on a wall ahead and on one to the
-left. The beam is infrared: a telephone's camera shows it.
+Pitch and roll follow from the height of the beam above the floor: at the lidar, on a wall ahead and on a wall to the
+left. The beam is infrared: the camera of a phone shows it.
 """
 
 import math
@@ -41,8 +41,8 @@ from monstertruckd.tools.calibrate.weave import weaves
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
 ROOM: Final = (
-    "3 m x 3 m, with walls in sight on several sides; for heights a tape, a level floor, and a wall straight ahead and "
-    "one to the left"
+    "3 m x 3 m, with walls visible on several sides; for heights a tape, a level floor, a wall straight "
+    "ahead and one to the left"
 )
 QUARTER: Final = math.pi / 2
 LEAST_OVERLAP: Final = 0.5
@@ -50,9 +50,9 @@ LEAST_OVERLAP: Final = 0.5
 LEAST_SCANS: Final = 3
 """Minimum scans at each rest."""
 MOST_TILT: Final = math.sin(math.radians(20.0))
-"""Rise of the beam per metre, at most: more is a wrong number."""
+"""Maximum rise of the beam per metre: more indicates a wrong reading."""
 HEIGHTS: Final = (
-    Number("centre", "Height of the lidar's beam over the floor, at its window, cm", 1.0, 200.0),
+    Number("centre", "Height of the lidar's beam above the floor, at its window, cm", 1.0, 200.0),
     Number("ahead", "Height of the beam on the wall straight ahead, cm", 1.0, 250.0),
     Number("left", "Height of the beam on the wall straight to the left, cm", 1.0, 250.0),
 )
@@ -65,7 +65,7 @@ class LidarLeg:
     distance: float
     """Distance of the body by the drive's count, m, negative backwards."""
     seen: tuple[float, float, float]
-    """Motion of the lidar in its own first frame, m and rad."""
+    """Motion of the lidar in its initial frame, m and rad."""
     sigma: float
     """Standard deviation of its position, m."""
     travel: float = 0.0
@@ -73,15 +73,15 @@ class LidarLeg:
 
     @classmethod
     def of(cls, record: MoveRecord, chassis: Chassis, mount: tuple[float, float, float]) -> "LidarLeg":
-        """Build it from a move with steady steering.
+        """Create it from a move with constant steering.
 
         Args:
-            record: with scans.
-            chassis: for distance and direction.
-            mount: as configured, for the first guess.
+            record: record with scans.
+            chassis: kinematics, for distance and direction.
+            mount: configured mount, as a first guess.
 
         Raises:
-            InputError: too few scans at rest, or scans that do not fit together.
+            InputError: too few scans at rest, or scans that do not match.
         """
         scans, after = (resting_scan(found) for found in record.at_rest(topics.SCAN))
         _, front, rear = record.steps()
@@ -101,28 +101,30 @@ class LidarLeg:
             )
         errors = np.sqrt(np.diag(np.linalg.inv(fit.information)))
         x, y, yaw = fit.pose.tolist()
-        least = 0.002  # least standard deviation of a registered position, m: walls are not straight to less
+        least = 0.002  # minimum standard deviation of a registered position, m: walls are not perfectly straight
         return cls(distance, (x, y, yaw), math.hypot(least, float(np.max(errors[:2]))), math.atan2(aside, ahead))
 
 
 @dataclass(frozen=True, slots=True)
 class Offset:
-    """How far the odometry's stamps run ahead of the scans', by turning."""
+    """Measure the time offset between the stamps of odometry and scans, by turning."""
 
     value: Interval
-    """s."""
+    """Offset, s; positive if odometry is ahead."""
     samples: int
 
 
 @dataclass(frozen=True, slots=True)
 class LidarWizard:
-    """Quarter circles to both sides and straights; then weaves for the clocks, and heights where requested."""
+    """Wizard: quarter circles in both directions and straights, then weaves for the clocks, and heights on request."""
 
     name: ClassVar[WizardName] = "lidar"
-    doc: ClassVar[str] = "where the lidar sits on the body, and the offset of its clock, from scans between rests"
+    doc: ClassVar[str] = (
+        "pose of the lidar on the body, and offset of its clock, from scans at rest before and after each leg"
+    )
     room: ClassVar[str] = ROOM
     rounds: int = 1
-    """Full circles to each side, in quarters"""
+    """Number of full circles in each direction, driven in quarters"""
     heights: bool = False
     """Ask for the height of the beam, for pitch and roll"""
     tape_error: float = ASSUMED.tape_reading
@@ -131,11 +133,10 @@ class LidarWizard:
     async def __call__(self, context: WizardContext) -> Result:
         """Measure."""
         if context.config.devices.compass is None:
-            raise RequestRefusedError(Reason.NOT_SUPPORTED, "the lidar's mount is measured with a compass")
+            raise RequestRefusedError(Reason.NOT_SUPPORTED, "measuring the lidar's mount needs a compass")
         believed = tuple(float(context.value(f"{LIDAR}.{name}")) for name in ("x", "y", "yaw"))
         mount = (believed[0], believed[1], believed[2])
-        # First, so that a wrong number is refused before the robot drives, and the operator need not walk there
-        # afterwards.
+        # Ask first, so that a wrong number is refused before the robot drives.
         level = await self._level(context) if self.heights else ()
         await context.confirm(CLEAR)
         chassis = context.chassis
@@ -174,8 +175,8 @@ class LidarWizard:
         return moves
 
     async def _level(self, context: WizardContext) -> tuple[Estimate, ...]:
-        scans = await context.collect(Collect("distances of the walls", topics.SCAN, 10))
-        tilt = await context.collect(Collect("the robot's tilt", topics.COMPASS, 20))
+        scans = await context.collect(Collect("distances to the walls", topics.SCAN, 10))
+        tilt = await context.collect(Collect("tilt of the robot", topics.COMPASS, 20))
         joints = await joint_angles(context)
         ahead, left = (beam_distance(scans, angle) for angle in (0.0, QUARTER))
         heights = [(await context.ask(step)) / 100 for step in HEIGHTS]
@@ -191,7 +192,7 @@ class LidarWizard:
                 Interval(angle, NORMAL * ASSUMED.beam_angle(self.tape_error, distance)),
                 "rad",
                 2,
-                f"{sign}; 95 % of two heights {distance:.1f} m apart, and of the compass's tilt",
+                f"{sign}; 95 % interval from two heights {distance:.1f} m apart and the compass's tilt",
                 f"{LIDAR}.{name}",
             )
             for name, angle, distance, sign in found
@@ -199,23 +200,26 @@ class LidarWizard:
 
 
 async def joint_angles(context: WizardContext) -> tuple[float, float]:
-    """Pitch and roll of the joints below the lidar as they are now, rad; 0 where it has none.
+    """Current pitch and roll of the joints below the lidar, rad; 0 without joints.
 
     Raises:
         InputError: a servo does not answer.
     """
     if context.config.devices.stabiliser is None:
         return 0.0, 0.0
-    joints = await context.collect(Collect("joints of the lidar's mount", topics.STABILISER, 20))
+    joints = await context.collect(Collect("joint angles of the lidar's mount", topics.STABILISER, 20))
     read = [(j.pitch, j.roll) for j in joints if j.pitch is not None and j.roll is not None]
     if not read:
-        raise InputError("a servo of the stabiliser does not answer: where the lidar looks is not known")
+        raise InputError(
+            "a servo of the stabiliser does not answer, so the direction of the lidar is unknown: check its "
+            "cable and power"
+        )
     pitch, roll = np.mean(np.array(read), axis=0).tolist()
     return pitch, roll
 
 
 def crab_error(context: WizardContext) -> float:
-    """Standard deviation of the crab angle, rad: by the steering's calibration, or by eye."""
+    """Standard deviation of the crab angle, rad: from the steering's calibration, or by eye."""
     steering = context.known.get("steering")
     halves = []
     for axle in AXLES:
@@ -235,47 +239,50 @@ def result_of(
     offset: Offset | None,
     level: tuple[Estimate, ...] = (),
 ) -> Result:
-    """Fit and evaluate.
+    """Fit the mount and check it.
 
     Args:
-        legs: driven.
-        mount: as configured, m and rad.
+        legs: moves between rests.
+        mount: configured mount, m and rad.
         crab: standard deviation of the direction of travel, rad.
-        offset: offset of the clocks; None if not measured.
-        level: pitch and roll, where measured.
+        offset: offset of the clocks, s; None if not measured.
+        level: pitch and roll, if measured.
 
     Raises:
-        InputError: too few legs to one of the sides.
+        InputError: too few legs in one direction.
     """
     turned = np.array([leg.seen[2] for leg in legs])
     if not ((turned > 0.5).sum() >= 2 and (turned < -0.5).sum() >= 2 and (np.abs(turned) < 0.3).any()):
-        raise InputError("expected arcs to both sides, two each, and a straight")
+        raise InputError("expected two arcs in each direction and a straight")
     fit = fit_mount(legs, mount, crab)
     halves = known_errors(fit, 2 * len(legs) - 4)
     if not np.isfinite(halves[:3]).all():
-        raise InputError("the mount is not determined by the legs: more than half a metre off, or the scans do not fit")
+        raise InputError("the legs do not determine the mount: it is more than 0.5 m off, or the scans do not match")
     x, y, yaw = (Interval(float(v), float(h)) for v, h in zip(fit.parameters[:3], halves[:3], strict=True))
-    noise = "95 % of scans and slip"
+    noise = "95 % interval from scans and slip"
     x = x.joined(NORMAL * ASSUMED.turning_centre)
     estimates = [
-        estimated("x", x, "m", len(legs), f"before the body's middle; {noise}", f"{LIDAR}.x"),
+        estimated("x", x, "m", len(legs), f"in front of the middle of the body; {noise}", f"{LIDAR}.x"),
         estimated("y", y, "m", len(legs), f"left of it; {noise}", f"{LIDAR}.y"),
         estimated(
             "yaw", yaw, "rad", len(legs),
-            f"against the direction of travel, left positive; {noise}, and of what the robot may crab", f"{LIDAR}.yaw",
+            f"relative to the direction of travel, left positive; {noise}, and the robot's possible "
+                "sideways drift", f"{LIDAR}.yaw",
         ),
         *level,
     ]  # fmt: skip
     if offset is not None:
-        text = "by which odometry runs ahead of the scans, for information"
-        estimates.append(estimated("time_offset", offset.value, "s", offset.samples, f"{text}; 95 % of the turns"))
+        text = "ratio of odometry to scan distance, for information"
+        estimates.append(
+            estimated("time_offset", offset.value, "s", offset.samples, f"{text}; 95 % interval of the turns")
+        )
     return Result(
         wizard="lidar",
-        measured=f"{len(legs)} legs between rests; unexplained {1000 * _unexplained(fit, legs):.1f} mm",
+        measured=f"{len(legs)} legs between rests; residual {1000 * _unexplained(fit, legs):.1f} mm",
         estimates=tuple(estimates),
         unobserved=(
-            "a robot that crabs looks like a lidar that is turned",
-            *(() if level else ("pitch and roll of its plane: measure heights (--heights)",)),
+            "sideways drift: a robot that crabs looks like a rotated lidar",
+            *(() if level else ("pitch and roll of the scan plane: measure heights (--heights)",)),
         ),
         partial=not level,
     )
@@ -292,14 +299,17 @@ def fit_mount(legs: Sequence[LidarLeg], mount: tuple[float, float, float], crab:
     def residual(parameters: Array) -> Array:
         found = seen_motion(parameters, distances, seen[:, 2], travels)
         off = (found[:, :2] - seen[:, :2]) / sigmas[:, None]
-        # 0.02: standard deviation of the scale of all distances before it is measured
+        # 0.02: standard deviation of the distance scale before the measurement
         return np.append(off.ravel(), ((parameters[3] - 1.0) / 0.02, parameters[4] / max(crab, 1e-6)))
 
     return least_squares(residual, start, start - reach, start + reach)
 
 
 def seen_motion(parameters: Array, distances: Array, turns: Array, travels: Array) -> Array:
-    """Motion of the lidar on legs, (n, 3): parameters as of ``fit_mount``; distances, m, turns and directions, rad."""
+    """Predict the lidar's motion on legs, (n, 3): parameters as in ``fit_mount``.
+
+    Distances in m, turns and directions in rad.
+    """
     x, y, yaw, scale, crab = parameters.tolist()
     mount = np.array((x, y, yaw))
     return np.array(
@@ -311,7 +321,7 @@ def seen_motion(parameters: Array, distances: Array, turns: Array, travels: Arra
 
 
 def _arc(distance: float, crab: float, turn: float) -> Array:
-    """Motion of the body on an arc that it travels at an angle to its axis."""
+    """Motion of the body on an arc, at an angle between its axis and its direction of travel."""
     half = turn / 2
     chord = distance * sinc(half)
     return np.array((chord * math.cos(half + crab), chord * math.sin(half + crab), turn))
@@ -327,31 +337,32 @@ def _unexplained(fit: FitResult, legs: Sequence[LidarLeg]) -> float:
 
 
 def check_way_round(before: Scan, after: Scan, moved: tuple[float, float], mount: Array, overlap: float) -> None:
-    """Raise where scans fit together much better if the lidar is upside down, or looks backwards.
+    """Raise InputError if scans match much better for a lidar that is upside down or faces backwards.
 
     Args:
         before: scan at the first rest.
-        after: and at the second one.
+        after: scan at the second rest.
         moved: distance (m) and turn (rad) of the body.
         mount: as configured.
-        overlap: overlap of the scans as they are.
+        overlap: overlap of the scans with the configured mount.
 
     Raises:
-        InputError: so it is.
+        InputError: the lidar is mounted the other way.
     """
     body = _arc(moved[0], 0.0, moved[1])
     mountings = (
         ("is upside down", _mirrored, mount),
-        ("looks backwards: its mount's yaw is near 3.14", _as_seen, mount + np.array((0.0, 0.0, math.pi))),
+        ("faces backwards: its mount's yaw is near 3.14", _as_seen, mount + np.array((0.0, 0.0, math.pi))),
     )
     for what, seen, turned in mountings:
         guess = between(turned, compose(body, turned))
         found = register(seen(after), Cloud.of(seen(before)), guess, reach=0.3)
         found = register(seen(after), Cloud.of(seen(before)), found.pose)
-        # 0.2: minimum gain in overlap to report a reversed mount
+        # 0.2: minimum gain in overlap that shows a reversed mount
         if found.overlap > max(LEAST_OVERLAP, overlap + 0.2):
             raise InputError(
-                f"the lidar {what}: a leg's scans overlap by {found.overlap:.0%} so, by {overlap:.0%} as configured"
+                f"the lidar {what}: the scans of a leg overlap by {found.overlap:.0%} with that mount and "
+                f"by {overlap:.0%} as configured"
             )
 
 
@@ -369,10 +380,10 @@ def _geometry(scan: LaserScan) -> ScanGeometry:
 
 
 def resting_scan(scans: Sequence[LaserScan]) -> Scan:
-    """Points of the mean of scans at rest, in the lidar's frame.
+    """Points of the mean of several scans at rest, in the lidar's frame.
 
     Raises:
-        InputError: too few.
+        InputError: too few scans.
     """
     if len(scans) < LEAST_SCANS:
         raise InputError(f"only {len(scans)} scans at rest: expected {LEAST_SCANS} at each end")
@@ -388,7 +399,7 @@ def beam_distance(scans: Sequence[LaserScan], angle: float) -> float:
     """Median range around an angle, m.
 
     Raises:
-        InputError: nothing there.
+        InputError: no wall is visible.
     """
     found = []
     for scan in scans:
@@ -396,35 +407,36 @@ def beam_distance(scans: Sequence[LaserScan], angle: float) -> float:
         near = slice(max(beam - 2, 0), beam + 3)
         found += scan.ranges[near][scan.codes[near] == VALID_BEAM].tolist()
     if not found:
-        raise InputError(f"no wall is seen at {math.degrees(angle):.0f} degrees: the heights need one there")
+        raise InputError(f"no wall is visible at {math.degrees(angle):.0f} degrees: the heights need one there")
     return float(np.median(found))
 
 
 def beam_tilt(heights: Sequence[float], walls: tuple[float, float]) -> tuple[float, float]:
-    """Pitch, nose down positive, and roll, right side down positive, of the beam's plane, rad.
+    """Compute pitch (nose down positive) and roll (right side down positive) of the scan plane, rad.
 
     Args:
-        heights: heights of the beam at the lidar, on the wall ahead and on the one to the left, m.
-        walls: distances of these, m.
+        heights: heights of the beam at the lidar, on the wall ahead and on the wall to the left, m.
+        walls: distances to the two walls, m.
 
     Raises:
-        InputError: heights that no lidar has.
+        InputError: the heights are impossible.
     """
     centre, ahead, left = heights
     falls, rises = (centre - ahead) / walls[0], (left - centre) / walls[1]
     for name, height, wall, slope in (("ahead", ahead, walls[0], falls), ("left", left, walls[1], rises)):
         if abs(slope) > MOST_TILT:
             raise InputError(
-                f"{name}: a beam {100 * centre:.0f} cm at the lidar and {100 * height:.0f} cm on a wall {wall:.1f} "
-                f"m away leans by more than {math.degrees(math.asin(MOST_TILT)):.0f} degrees: measure again, in cm"
+                f"{name}: a beam {100 * centre:.0f} cm high at the lidar and {100 * height:.0f} cm on a "
+                f"wall {wall:.1f} m away is tilted by more than {math.degrees(math.asin(MOST_TILT)):.0f} "
+                "degrees: measure again, in cm"
             )
     return math.asin(falls), math.asin(rises)
 
 
 def time_offset(records: Sequence[MoveRecord]) -> Offset | None:
-    """Offset of the clocks of odometry and scans, from weaving; None if it cannot be determined.
+    """Estimate the offset of the clocks of odometry and scans from weaving; None if it cannot be determined.
 
-    The correlation of ``find_offset`` finds a gross one; least squares of the yaws refine it.
+    The correlation of ``find_offset`` finds a large offset; least squares of the yaws refine it.
     """
     series = [found for record in records if (found := _yaws(record)) is not None]
     if not series:
@@ -434,11 +446,11 @@ def time_offset(records: Sequence[MoveRecord]) -> Offset | None:
 
 
 def fit_offset(series: Sequence[tuple[Array, Array, Array, Array]], coarse: float | None) -> Offset:
-    """Least-squares fit of the offset.
+    """Fit the offset by least squares.
 
     Args:
-        series: series of each move, times (s) and yaws (rad) of the scans, times and yaws of odometry.
-        coarse: first guess, s; None for 0.
+        series: for each move, times (s) and yaws (rad) of the scans, and times and yaws of odometry.
+        coarse: first guess, s; None: 0.
     """
 
     def residual(parameters: Array) -> Array:
@@ -457,7 +469,10 @@ def fit_offset(series: Sequence[tuple[Array, Array, Array, Array]], coarse: floa
 
 
 def _yaws(record: MoveRecord) -> tuple[Array, Array, Array, Array, Array] | None:
-    """Stamps and yaws of the scans, odometry's yaws then, and its own stamps and yaws; None = too few."""
+    """Stamps and yaws of the scans, odometry's yaws at these stamps, and its own stamps and yaws.
+
+    None if there are too few.
+    """
     scans, odometry = record.of(topics.SCAN), record.of(topics.ODOMETRY)
     before = [scan for scan in scans if scan.stamp < record.left]
     if len(before) < LEAST_SCANS or len(odometry) < 2 or len(scans) < 4 * LEAST_SCANS:
@@ -465,7 +480,7 @@ def _yaws(record: MoveRecord) -> tuple[Array, Array, Array, Array, Array] | None
     cloud = Cloud.of(resting_scan(before))
     pose, stamps, yaws = np.zeros(3), [], []
     for scan in scans:
-        # The middle of a scan, which takes a tenth of a second, stands for it.
+        # A scan takes a tenth of a second; its middle counts as its time.
         points = prepare(np.where(scan.codes == VALID_BEAM, scan.ranges, np.inf), _geometry(scan))
         fit = register(points, cloud, pose, reach=0.3)
         if fit.overlap < LEAST_OVERLAP:

@@ -1,4 +1,4 @@
-"""Moves of a wizard: drive requests as an ordinary operator, through the safety gate."""
+"""Moves of a wizard: drive requests sent through the safety gate, as by any operator."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
@@ -26,13 +26,13 @@ ANSWERED: Final = 3.0
 RESTING: Final = 5.0
 """Time limit for coming to rest (s)."""
 LATE: Final = (
-    "requests came too late: end what else keeps this computer or the link to the robot busy, or run the command on "
-    "the robot's own computer, and repeat it; nothing was saved"
+    "drive requests arrived too late: stop other programs that load this computer or the link to the "
+    "robot, or run the command on the robot's computer; repeat it (nothing was saved)"
 )
 """Advice for an expired lease."""
 SILENT: Final = (
-    "a device was silent (`monstertruckd status` names it), or the robot's computer is too busy: end what keeps it so, "
-    "and repeat the command; nothing was saved"
+    "a device was silent (`monstertruckd status` names it), or the robot's computer is overloaded: stop "
+    "other programs on it and repeat the command (nothing was saved)"
 )
 """Advice for late measurements or ticks."""
 ADVICE: Final = {
@@ -43,7 +43,7 @@ ADVICE: Final = {
     Reason.ATTITUDE_STALE: SILENT,
     Reason.TICK_STALLED: SILENT,
 }
-"""Advice by transient reason; a move stopped for one of these reasons is repeated."""
+"""Advice by transient stop reason; the mover repeats a move stopped for one of these reasons."""
 
 
 class Mover:
@@ -70,9 +70,9 @@ class Mover:
 
         Raises:
             RequestRefusedError: the gate refused, stopped or holds the truck; carries the gate's reason.
-            NoAnswerError: the truck does not move although nothing holds it, or sends no feedback.
+            NoAnswerError: the truck does not move although the gate allows it, or sends no feedback.
         """
-        unmoved = 0.01  # maximum distance of a truck still at the start of its move (m)
+        unmoved = 0.01  # maximum distance from the start at which a move counts as not begun (m)
         depth = 4096
         with (
             ExitStack() as besides,
@@ -85,7 +85,7 @@ class Mover:
         ):
             feeds = drive, steering, attitude, gate, steering_commands, drive_commands
             also = {t.name: besides.enter_context(self._truck.subscribe(t, fifo(depth))) for t in move.also}
-            for left in (2, 1, 0):  # restarts left after a transient stop
+            for left in (2, 1, 0):  # maximum number of restarts after a transient stop
                 run = _Run(self._truck, self._clock, feeds, also)
                 try:
                     await self._once(run, move, report)
@@ -94,14 +94,14 @@ class Mover:
                     covered = await run.coasted(self._drivetrain) if left and error.refusal in ADVICE else None
                     if covered is None or (move.marked and covered > unmoved):
                         raise
-                    say(f"{move.name}: {error.refusal.text}; back to where it began, and once more")
+                    say(f"{move.name}: {error.refusal.text}; returning to the start for another attempt")
                 if covered > unmoved:
                     await self._once(_Run(self._truck, self._clock, feeds, also), move.back(covered), report)
             return run.track
 
     async def _once(self, run: "_Run", move: MoveStep, report: Callable[[MoveRecord, float], None]) -> None:
         async with self._armed(run):
-            steering = 1.0  # time to turn the wheels while the truck stands (s)
+            steering = 1.0  # time for the wheels to turn while the truck stands (s)
             if move.approach:
                 await run.hold(0.0, move.approach, move.approach, steering)
             await run.hold(0.0, move.front, move.rear, steering)
@@ -180,7 +180,7 @@ class _Run:
         self.track = MoveRecord()
 
     async def free(self) -> None:
-        """Make sure that no other operator uses the truck.
+        """Check that no other operator uses the truck.
 
         Raises:
             RequestRefusedError: the truck is armed.
@@ -194,7 +194,7 @@ class _Run:
             self._take()
         if self.state.mode.active:
             holder = f", {self.state.holder} drives" if self.state.holder else ""
-            raise RequestRefusedError(Reason.BUSY, f"the robot is armed already{holder}: disarm it first")
+            raise RequestRefusedError(Reason.BUSY, f"the robot is already armed{holder}: disarm it first")
 
     async def arm(self) -> None:
         """Request standstill for a moment, and arm without planners, so that nothing else moves the truck.
@@ -314,7 +314,7 @@ class _Run:
         reasons = state.hindrances
         if not reasons and state.mode is GateMode.DRIVING:
             raise RequestRefusedError(Reason.BUSY, f"{state.holder} drives the robot")
-        if not reasons and state.mode.active:  # still armed, but no longer held by this wizard's requests
+        if not reasons and state.mode.active:  # still armed, but no longer controlled by this wizard
             reasons = (Reason.LEASE_EXPIRED,)
         text = in_words(reasons) or f"the robot is {state.mode}"
         advice = "".join(f"; {text}" for text in dict.fromkeys(ADVICE[r] for r in reasons if r in ADVICE))

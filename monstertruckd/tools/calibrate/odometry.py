@@ -1,9 +1,10 @@
 """Distance scale, wheelbase and steering offset of dead reckoning, from squares driven in both directions.
 
-After the test of Borenstein and Feng ("Measurement and Correction of Systematic Odometry Errors in Mobile Robots", IEEE
-Transactions on Robotics and Automation, 1996): errors of the offset turn a square driven to the left and one driven to
-the right in the same sense, errors of the wheelbase in opposite ones. Theirs is for two wheels that are driven apart;
-here corners are arcs of a truck that steers both axles, a tape gives the first side, and the compass every leg's turn.
+Based on the test of Borenstein and Feng ("Measurement and Correction of Systematic Odometry Errors in Mobile Robots",
+IEEE Transactions on Robotics and Automation, 1996): an offset error rotates a square driven to the left and one driven
+to the right in the same direction, a wheelbase error in opposite directions. The original is for two separately driven
+wheels. Here the corners are arcs of a truck with two steered axles, a tape measures the first side, and the compass
+measures the turn of every leg.
 """
 
 import math
@@ -29,47 +30,50 @@ from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
 ROOM: Final = "3.5 m x 3.5 m on either side: squares of 2.4 m to the left and to the right of the robot, level"
 CORNER: Final = 0.08
-"""Speed in the corners, m/s: fast ones are wider, as tyres slip outward."""
+"""Speed in the corners, m/s: at higher speed tyres slip outwards and widen the corner."""
 ANGLE: Final = 0.35
 """Angle of both axles in the corners, in opposite directions, rad."""
 BELIEVED: Final = (0.05, 0.05, math.radians(6.0))
-"""Standard deviations before anything is measured: share of distance and of wheelbase, servo angle, rad."""
+"""Standard deviations before the measurement: relative distance, relative wheelbase, servo angle (rad)."""
 
 _MARK: Final = Confirm(
     "mark",
-    "Mark the floor straight below the middle of the front bumper, and lay a string ahead along the axis. Done?",
+    "Mark the floor vertically below the middle of the front bumper, and lay a string straight ahead "
+    "along the robot's axis. Done?",
 )
-_SIDE: Final = Number("side", "Distance from the mark to below the middle of the front bumper now, m", 0.2, 20.0)
+_SIDE: Final = Number(
+    "side", "Distance from the mark to the point below the middle of the front bumper now, m", 0.2, 20.0
+)
 _AHEAD: Final = Number(
-    "ahead", "How far along the string has the middle of the front bumper moved off its mark, cm, ahead positive?",
+    "ahead", "How far along the string has the middle of the front bumper moved from the mark, cm (ahead positive)?",
     -300.0, 300.0,
 )  # fmt: skip
-_LEFT: Final = Number("left", "And how far off the string, cm, left positive?", -300.0, 300.0)
+_LEFT: Final = Number("left", "And how far sideways from the string, cm (left positive)?", -300.0, 300.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Square:
-    """One square as it was driven, and where the truck came to."""
+    """One driven square, and the truck's final position."""
 
     legs: tuple[SteeringRun, ...]
-    """Side and corner in turn."""
+    """Sides and corners in turn."""
     side: float
-    """First side by the tape, m."""
+    """Taped length of the first side, m."""
     off: tuple[float, float]
-    """Front bumper from its mark at the end, ahead and left, m."""
+    """Position of the front bumper relative to its mark at the end, ahead and left, m."""
 
 
 @dataclass(frozen=True, slots=True)
 class OdometryWizard:
-    """A square to the left, the same to the right, as often as requested."""
+    """Wizard: squares to the left and right in turn."""
 
     name: ClassVar[WizardName] = "odometry"
     doc: ClassVar[str] = (
-        "distance scale, wheelbase and steering offset of dead reckoning, from squares driven to both sides"
+        "distance scale, wheelbase and steering offset of dead reckoning, from squares driven in both directions"
     )
     room: ClassVar[str] = ROOM
     rounds: int = 1
-    """Squares to each side"""
+    """Number of squares in each direction"""
     side: float = 1.5
     """Length of its straight parts, m; corners add 0.7 m each"""
     tape_error: float = ASSUMED.tape_reading
@@ -82,7 +86,8 @@ class OdometryWizard:
         if not isinstance(context.chassis, TruckChassis):
             raise RequestRefusedError(
                 Reason.NOT_SUPPORTED,
-                "only a body with two steered axles drives squares of arcs; slip is for skid steer",
+                "only a body with two steered axles can drive squares of arcs; use `calibrate slip` for "
+                "a skid-steer body",
             )
         maps = Maps.of(context.config)
         await context.confirm(CLEAR)
@@ -112,7 +117,7 @@ class OdometryWizard:
         return Square(tuple(legs), taped, (await context.ask(_AHEAD) / 100, await context.ask(_LEFT) / 100))
 
     def judge(self, context: WizardContext, maps: Maps, squares: Sequence[Square]) -> Result:
-        """Fit and evaluate."""
+        """Fit the parameters and check them."""
         chassis, geometry = context.chassis, context.config.geometry
         assert isinstance(chassis, TruckChassis)
         model = SquareModel(SteeringModel(chassis), maps, geometry.length / 2)
@@ -131,26 +136,28 @@ class OdometryWizard:
                 low=geometry.drive_ratio / distance.high,
                 high=geometry.drive_ratio / distance.low,
                 samples=len(squares),
-                meaning=f"motor turns per turn of wheels of {geometry.wheel_radius:g} m; 95 % of tape and slip, and "
-                f"{ASSUMED.floor_slip:.1%} of other floors",
+                meaning=f"motor turns per turn of wheels of {geometry.wheel_radius:g} m; 95 % interval from tape "
+                    f"and slip, and {ASSUMED.floor_slip:.1%} for other floors",
                 key="geometry.drive_ratio",
             ),
             estimated(
                 "wheel_radius", distance.times(geometry.wheel_radius), "m", len(squares),
-                "wheels, by the configured ratio",
+                "wheel radius, at the configured gear ratio",
             ),
             estimated(
                 "wheelbase",
                 base.times(geometry.wheelbase),
                 "m",
                 legs,
-                f"that the turns show; 95 % of the legs' noise, {ASSUMED.square_linkage:.1%} of the linkage, "
-                f"and {ASSUMED.square_on_the_spot:.1%} of wheels that are steered while it stands",
+                "effective wheelbase, from the turns; 95 % interval from the noise of the legs, "
+                    f"{ASSUMED.square_linkage:.1%} for the linkage, and {ASSUMED.square_on_the_spot:.1%} for "
+                    "steering at standstill",
                 "geometry.wheelbase",
             ),
             estimated(
                 "offset", offset.times(math.degrees(1.0)), "deg", legs,
-                "of the servos, in front to the left and at the rear to the right; 95 % of the legs' noise",
+                "offset of the servos, front to the left and rear to the right; 95 % interval from the "
+                    "noise of the legs",
             ),
         ]  # fmt: skip
         for axle, name in enumerate(AXLES):
@@ -162,38 +169,45 @@ class OdometryWizard:
                 known = (common.high - common.low) / 2
             half = math.hypot(math.degrees(offset.half) * abs(scale), known)
             centre = Interval(maps.centres[axle] - moved, half)
-            text = "pulse that steers straight ahead; 95 % of the legs' noise, and what both axles may be off together"
+            text = (
+                "pulse that steers straight ahead; 95 % interval from the noise of the legs and a common "
+                "offset of both axles"
+            )
             estimates.append(estimated(f"{name}_centre", centre, "us", legs, text, f"{STEERING}.{name}.centre_us"))
         errors = [math.hypot(*square.off) for square in squares]
         left = [math.dist(model.end(square, fit.parameters), square.off) for square in squares]
         return Result(
             wizard="odometry",
-            measured=f"{len(squares)} squares of {4 * self.side + 2.8:.0f} m; off the mark by "
-            f"{', '.join(f'{100 * e:.0f}' for e in errors)} cm, unexplained {100 * max(left):.0f} cm",
+            measured=f"{len(squares)} squares of {4 * self.side + 2.8:.0f} m; ended "
+            f"{', '.join(f'{100 * e:.0f}' for e in errors)} cm from the mark, residual "
+            f"{100 * max(left):.0f} cm",
             estimates=tuple(estimates),
             unobserved=(
-                "gear ratio and wheel radius apart from each other",
-                "equal errors of both centres: the robot crabs, and its squares close",
-                "the wheelbase apart from the servos' scale: their product is measured",
+                "gear ratio and wheel radius separately",
+                "equal errors of both centres: the robot crabs, and its squares still close",
+                "the wheelbase separately from the servos' scale: only their product is measured",
             ),
         )
 
 
 def _turned(record: MoveRecord, left: float) -> bool:
-    """Whether it has turned by so many rad, left positive: a corner compensates the bend of the sides."""
+    """Return a condition: whether the truck has turned by an angle (rad, left positive).
+
+    A corner thus compensates a bent side.
+    """
     return record.turned() * math.copysign(1.0, left) >= abs(left)
 
 
 class SquareModel:
-    """Squares as dead reckoning sees them.
+    """Model of dead reckoning on squares.
 
-    Parameters: distance and wheelbase as shares of the configured ones, offset of the servos (rad), in front to the
-    left and at the rear to the right.
+    Parameters: relative distance, relative wheelbase, and offset of the servos (rad): front to the left, rear to the
+    right.
 
     Args:
         model: model of the truck.
-        maps: maps of the servos, that the daemon runs with.
-        ahead: front bumper before the base, m.
+        maps: servo maps used by the daemon.
+        ahead: distance of the front bumper from the base, m.
     """
 
     def __init__(self, model: SteeringModel, maps: Maps, ahead: float) -> None:
@@ -202,7 +216,7 @@ class SquareModel:
         self._ahead = ahead
 
     def maps(self, offset: float) -> Maps:
-        """Shift the servos by ``offset``, rad, to the left in front, and to the right at the rear."""
+        """Shift the servos by ``offset``, rad: front to the left, rear to the right."""
         shift = math.degrees(offset)
         front, rear = (
             c - s * d for c, s, d in zip(self._maps.centres, self._maps.scales, (shift, -shift), strict=True)
@@ -210,13 +224,13 @@ class SquareModel:
         return Maps((front, rear), self._maps.scales, self._maps.deficit)
 
     def turns(self, legs: Sequence[SteeringRun], parameters: Array) -> Array:
-        """Turns of legs, rad; (n,)."""
+        """Predict the turns of legs, rad; (n,)."""
         distance, base, offset = parameters
         turns, _ = self._model.predict(legs, self.maps(float(offset)))
         return np.asarray(turns * distance / base)
 
     def end(self, square: Square, parameters: Array) -> tuple[float, float]:
-        """Front bumper from its mark at the end of a square, ahead and left, m: headings as measured."""
+        """Predict the bumper's position ahead and left of its mark at the end of a square (m)."""
         distance, base, offset = parameters.tolist()
         maps = self.maps(offset)
         chassis = self._model.chassis
@@ -243,7 +257,7 @@ class SquareModel:
         return x + self._ahead * (math.cos(yaw) - 1.0), y + self._ahead * math.sin(yaw)
 
     def fit(self, squares: Sequence[Square], tape: float, string: float) -> FitResult:
-        """Solve by least squares; residuals in standard deviations, the priors last."""
+        """Fit by least squares; residuals in standard deviations, priors last."""
         legs = [leg for square in squares for leg in square.legs]
         turned = np.array([leg.turn for leg in legs])
         sigmas = np.array([ASSUMED.turn_of_leg(leg.sigma, self._model.distance(leg)) for leg in legs])
@@ -271,29 +285,29 @@ class SquareModel:
 
 
 def check_senses(model: "SquareModel", squares: Sequence[Square]) -> None:
-    """Refuse turns against the steering, of the truck or of an axle.
+    """Refuse turns opposite to the steering.
 
     Raises:
-        InputError: so it is.
+        InputError: the truck or an axle turned the wrong way.
     """
     legs = [leg for square in squares for leg in square.legs]
     said, turned = model.turns(legs, np.array((1.0, 1.0, 0.0))), np.array([leg.turn for leg in legs])
     share = float(said @ turned) / float(said @ said)
-    if share < 0.5:  # share of the turn by the steering that the compass must see
+    if share < 0.5:  # minimum ratio of the turn by the compass to the turn by the steering
         raise InputError(
-            f"the corners turn by {share:.0%} of what the steering says: an axle steers the other way, or its servo is "
-            "on another channel; calibrate the steering first"
+            f"the robot turned {share:.0%} as far in the corners as steered: an axle steers the wrong "
+            "way, or its servo is on another channel; calibrate the steering first"
         )
 
 
 def intervals(fit: FitResult, measured: int) -> tuple[Interval, Interval, Interval]:
-    """Corrections of distance and wheelbase (fractions) and offset (rad), from so many measurements.
+    """Return corrections of distance and wheelbase (fractions) and offset (rad).
 
     Raises:
-        InputError: they are off by more than a fit may find.
+        InputError: a correction exceeds its limit.
     """
     halves = known_errors(fit, measured - fit.parameters.size)
     if not np.isfinite(halves).all():
-        raise InputError("the squares are off by more than 30 %: calibrate drive and steering first")
+        raise InputError("the squares deviate by more than 30 %: calibrate drive and steering first")
     distance, base, offset = (Interval(float(x), float(h)) for x, h in zip(fit.parameters, halves, strict=True))
     return distance, base, offset

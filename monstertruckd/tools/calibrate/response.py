@@ -90,7 +90,7 @@ class ResponseFit:
             lambda parameters: residuals(*parameters.tolist()), np.array((0.08, 0.03**2)), -bounds, bounds
         )
         if not np.isfinite(fit.standard_errors).all():
-            raise InputError("dead time and lag do not show: does the robot follow its commands?")
+            raise InputError("dead time and lag cannot be determined: check that the robot follows its commands")
         halves = NORMAL * correlation_factor(fit.residuals) * fit.standard_errors
         delay, squared = (Interval(float(x), float(half)) for x, half in zip(fit.parameters, halves, strict=True))
         return cls(delay.joined(CONFIDENCE * wait), squared.widened(rounded), fit.residuals.size)

@@ -1,8 +1,7 @@
-"""Turning centres and effective wheels of a skid-steer body, from arcs between two rests.
+"""Turning centres and effective wheel radii of a skid-steer body, from arcs between two rests.
 
-A test stand, or the pose in map, gives the body's position (``--by``). Each arc has one ratio of wheel rates, so
-that its motion is the exponential of one twist; only wheel turns and averaged poses at rest are used, so delays have no
-effect.
+A test stand, or the pose in map, measures the body's position (``--by``). Each arc has one ratio of wheel rates, so its
+motion is the exponential of one twist. Only wheel turns and averaged poses at rest are used, so delays have no effect.
 """
 
 import math
@@ -30,9 +29,9 @@ from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
 Observer = Literal["stand", "pose"]
 OBSERVERS: Final[dict[Observer, Topic[Any]]] = {"stand": topics.STAND_POSE, "pose": topics.POSE}
-ROOM: Final = "ten lengths of the robot around it"
+ROOM: Final = "free floor around the robot, ten times its length across"
 RADII: Final = (4.0, 2.0, 0.0)
-"""Radii of the arcs, in tracks; 0 = straight."""
+"""Radii of the arcs, in track widths; 0: straight."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,22 +39,22 @@ class SkidArc:
     """One move between two rests."""
 
     left: float
-    """Turned by the left wheels themselves, rad, forward positive."""
+    """Rotation of the left and right wheels, rad, forward positive."""
     right: float
     motion: tuple[float, float, float]
-    """Motion of the body in its own first frame, m and rad."""
+    """Motion of the body in its initial frame, m and rad."""
     sigma: tuple[float, float]
     """Standard deviations of the motion's position (m) and heading (rad)."""
 
     @classmethod
     def of(cls, record: MoveRecord, observer: Observer, chassis: Chassis) -> "SkidArc":
-        """Build it from a move.
+        """Create it from a move.
 
         Raises:
             InputError: too few poses at rest, or a shaft without feedback.
         """
         before, after = record.at_rest(OBSERVERS[observer])
-        least = 5  # poses at each end, at least
+        least = 5  # minimum number of poses at each end
         if min(len(before), len(after)) < least:
             raise InputError(f"only {len(before)} and {len(after)} poses at rest: expected {least} at each end")
         (x0, y0, yaw0), (x1, y1, yaw1) = (_mean_pose([m.pose for m in poses]) for poses in (before, after))
@@ -74,15 +73,17 @@ class SkidArc:
 
 @dataclass(frozen=True, slots=True)
 class SlipWizard:
-    """Arcs to both sides, forward and back."""
+    """Wizard: arcs in both directions, forward and back."""
 
     name: ClassVar[WizardName] = "slip"
-    doc: ClassVar[str] = "turning centres and wheels of a skid-steer body, from arcs seen by a stand or in the map"
+    doc: ClassVar[str] = (
+        "turning centres and wheel radii of a skid-steer body, from arcs observed by a stand or in the map"
+    )
     room: ClassVar[str] = ROOM
     by: Observer = "stand"
     """Source of the robot's position: a test stand, or its own map"""
     rounds: int = 2
-    """Times that each arc is driven"""
+    """Number of times each arc is driven there and back"""
     turn: float = 2.0
     """Turn of each arc, rad"""
 
@@ -90,7 +91,9 @@ class SlipWizard:
         """Measure."""
         config = context.config
         if config.body.kind != "skid_steer":
-            raise RequestRefusedError(Reason.NOT_SUPPORTED, f"body {config.body.kind}: only a skid_steer one slips so")
+            raise RequestRefusedError(
+                Reason.NOT_SUPPORTED, f"body {config.body.kind}: slip is calibrated for a skid_steer body only"
+            )
         await context.confirm(CLEAR)
         bicycle, track = context.chassis.bicycle, config.geometry.track
         speed = 0.6 * min(config.gate.speed, config.gate.reverse_speed)
@@ -115,19 +118,19 @@ class SlipWizard:
 
 
 def result_of(arcs: Sequence[SkidArc], radius: float, half_track: float) -> Result:
-    """Fit and evaluate.
+    """Fit the parameters and check them.
 
     Args:
-        arcs: driven.
-        radius: radius of the wheels, nominal, m.
-        half_track: m.
+        arcs: driven arcs.
+        radius: nominal wheel radius, m.
+        half_track: half the track width, m.
 
     Raises:
-        InputError: too few arcs, or none to one of the sides.
+        InputError: too few arcs, or none in one direction.
     """
     turns = np.array([arc.motion[2] for arc in arcs])
     if len(arcs) < 4 or not ((turns > 0.3).any() and (turns < -0.3).any()):
-        raise InputError(f"{len(arcs)} arcs: expected at least 4, to both sides")
+        raise InputError(f"{len(arcs)} arcs: expected at least 4, in both directions")
     model = skid_model("icr and slip", radius, half_track, bounded=False, with_icr_x=True)
     seen = np.array([arc.motion for arc in arcs]).T
     distances = np.array([radius * max(abs(arc.left), abs(arc.right)) for arc in arcs])
@@ -146,27 +149,28 @@ def result_of(arcs: Sequence[SkidArc], radius: float, half_track: float) -> Resu
     fit = least_squares(residual, model.start, model.lower, model.upper)
     halves = known_errors(fit, fit.residuals.size - fit.parameters.size)
     if not np.isfinite(halves).all():
-        raise InputError("the arcs do not determine all turning centres: drive more of them, of several radii")
+        raise InputError("the arcs do not determine all turning centres: drive more arcs with several radii")
     values = dict(zip(model.parameters, fit.parameters.tolist(), strict=True))
     errors = dict(zip(model.parameters, halves.tolist(), strict=True))
     tilt = math.sqrt(values["slip_ratio"])
     share = math.hypot(errors["gain"] / values["gain"], errors["slip_ratio"] / values["slip_ratio"] / 2)
     gains = {"gain_left": values["gain"] / tilt, "gain_right": values["gain"] * tilt}
     rows = [(name, values[name], errors[name], math.inf, "m") for name in ("icr_left", "icr_right")]
-    # No body turns about a place before its base: beyond it by less than the error is at it.
+    # The turning centre of a real body is not ahead of its base; an apparent lead within the error is measurement
+    # error.
     most = 0.0 if values["icr_x"] <= errors["icr_x"] else math.inf
     rows.append(("icr_x", values["icr_x"], errors["icr_x"], most, "m"))
     rows += [(name, value, share * value, math.inf, "") for name, value in gains.items()]
     meanings = {
         "icr_left": "turning centre of the left wheels, left of the middle",
         "icr_right": "turning centre of the right wheels",
-        "icr_x": "turning centres before the middle",
+        "icr_x": "turning centres, ahead of the middle",
         "gain_left": "effective over nominal radius of the left wheels",
         "gain_right": "effective over nominal radius of the right wheels",
     }
     return Result(
         wizard="slip",
-        measured=f"{len(arcs)} arcs between rests; residuals {fit.rms:.2f} of the expected noise",
+        measured=f"{len(arcs)} arcs between rests; residuals {fit.rms:.2f} times the expected noise",
         estimates=tuple(
             Estimate(
                 name=name,
@@ -175,17 +179,17 @@ def result_of(arcs: Sequence[SkidArc], radius: float, half_track: float) -> Resu
                 high=min(value + half, most),
                 unit=unit,
                 samples=len(arcs),
-                meaning=f"{meanings[name]}, on this floor; 95 % of poses and skidding",
+                meaning=f"{meanings[name]}, on this floor; 95 % interval from poses and skidding",
                 key=f"body.{name}",
             )
             for name, value, half, most, unit in rows
         ),
-        unobserved=("another floor, another load", "what a reversal turns the body by, and slow sliding"),
+        unobserved=("another floor, another load", "rotation of the body when the wheels reverse, and slow sliding"),
     )
 
 
 def _check_sides(left: Array, right: Array, seen: Array) -> None:
-    """Raise where the sides are swapped, or one turns the other way.
+    """Raise InputError if the sides are swapped, or one turns in the wrong direction.
 
     Raises:
         InputError: the sides are swapped, or one is reversed; the message names the case.
@@ -194,9 +198,11 @@ def _check_sides(left: Array, right: Array, seen: Array) -> None:
     sides = {"left": float(ahead @ left), "right": float(ahead @ right)}
     wrong = [name for name, sense in sides.items() if sense < 0.0]
     if wrong:
-        raise InputError(f"the {' and '.join(wrong)} wheels count backwards while the body goes ahead: swap their sign")
+        raise InputError(
+            f"the {' and '.join(wrong)} wheels count backwards while the body moves ahead: invert their sign"
+        )
     if float((right - left) @ turned) < 0.0:
-        raise InputError("the body turns left where the left wheels are faster: the sides are swapped")
+        raise InputError("the body turns left when the left wheels are faster: left and right are swapped")
 
 
 def _turned(record: MoveRecord, shaft: int) -> float:

@@ -1,10 +1,10 @@
-"""Place and axis of every sonar, the width of their cones, and the speed of sound, from arcs next to a flat wall.
+"""Poses of the sonars, their cone angle, and the speed of sound, from arcs next to a flat wall.
 
-A wall sends the sound back along its normal, from wherever in the cone that is: a range is the sonar's distance from
-the wall while the normal lies in the cone, and the cone's edge meets the wall a little beyond. Arcs to both sides turn
-every sonar past the wall, and carry it towards the wall and away: that tells where it sits, where its cone ends and
-begins, and by the one taped distance the speed of sound. One circle would not: sonars whose places are turned about its
-centre look like a wall that is turned.
+A wall reflects the sound along its normal. A range is the sonar's distance from the wall while the normal lies within
+the cone; beyond that, the edge of the cone meets the wall at a slightly larger range. Arcs in both directions turn
+every sonar past the wall and move it towards the wall and away. So they determine the pose of the sonar, the edges of
+its cone and, from one taped distance, the speed of sound. A single circle would not: a rotation of all poses about its
+centre looks like a rotated wall.
 """
 
 import math
@@ -31,27 +31,30 @@ from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep, N
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
 ROOM: Final = (
-    "a flat wall 5 m long and as high as the sonars see, 1.7 m to the robot's left; nothing else within 2 m before, "
-    "behind and to the right of the robot"
+    "a flat wall 5 m long, as high as the sonars' cones reach, 1.7 m to the robot's left; no other "
+    "object within 2 m in front, behind and to the right of the robot"
 )
 FIRST_RANGE_ERROR: Final = 0.2
-"""Maximum error of a range from the wall before the fit, m."""
+"""Maximum error of a range to the wall before the fit, m."""
 BEYOND: Final = 0.3
-"""Past the cone's edge the wall is still heard, rad: grazing sound is reflected away."""
+"""Maximum angle beyond the edge of the cone at which a sonar still receives the wall, rad: grazing sound is reflected
+away.
+"""
 LEAST_ECHOES: Final = 12
-"""Minimum echoes per sonar for the fit of its place."""
+"""Minimum number of echoes per sonar for the fit of its pose."""
 COMMON: Final = 5
-"""Parameters before the arcs' parameters: distance and direction of the wall, half the cone, factors of the ranges and
-of the distance by odometry."""
+"""Parameters common to all arcs: distance and direction of the wall, half the cone angle, factors of ranges and of the
+odometry distance.
+"""
 
 _PARK: Final = Confirm(
-    "park", "Stand the robot along the wall, the wall 1.7 m to its left, the middle of the wall beside it. Done?"
+    "park", "Place the robot parallel to the wall, the wall 1.7 m to its left and the robot halfway along it. Done?"
 )
 _WALL: Final = Number("wall", "Distance from the wall to the middle of the robot's left side, m", 0.3, 3.0)
 
 
 class SonarPose(NamedTuple):
-    """Place and axis of one sonar on the body, or of one for each echo (n,), m and rad."""
+    """Pose of one sonar on the body, or of one for each echo (n,), m and rad."""
 
     x: float | Array
     y: float | Array
@@ -60,7 +63,7 @@ class SonarPose(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class SonarLeg:
-    """One arc: where the robot was at every ping, and what came back."""
+    """One arc: poses of the robot at every ping, and the ranges."""
 
     poses: Mapping[str, Array]
     """Poses by sonar, (n, 3): x, y (m) and yaw (rad) in the frame of the robot as it was parked"""
@@ -69,18 +72,18 @@ class SonarLeg:
 
     @classmethod
     def of(cls, record: MoveRecord, origin: tuple[float, float, float]) -> "SonarLeg":
-        """Build it from a move.
+        """Create it from a move.
 
         Args:
-            record: with odometry and sonars.
-            origin: x, y (m) and yaw (rad) of the odometry when the robot was parked.
+            record: record with odometry and sonars.
+            origin: odometry pose of the parked robot: x, y (m) and yaw (rad).
 
         Raises:
             InputError: no odometry.
         """
         odometry = record.of(topics.ODOMETRY)
         if len(odometry) < 2:
-            raise InputError("no odometry came while the robot moved")
+            raise InputError("no odometry was received while the robot moved")
         stamps = np.array([o.stamp for o in odometry], dtype=np.float64)
         x = np.array([o.pose.x for o in odometry]) - origin[0]
         y = np.array([o.pose.y for o in odometry]) - origin[1]
@@ -103,13 +106,13 @@ class SonarLeg:
 
 @dataclass(frozen=True, slots=True)
 class SonarWizard:
-    """An arc to each side, driven ahead and back, next to a wall."""
+    """Wizard: an arc in each direction, driven forward and back, next to a wall."""
 
     name: ClassVar[WizardName] = "sonar"
-    doc: ClassVar[str] = "places, directions and cones of the sonars, and the speed of sound, from arcs along a wall"
+    doc: ClassVar[str] = "poses and cone angles of the sonars, and the speed of sound, from arcs along a wall"
     room: ClassVar[str] = ROOM
     turn: float = 2 * math.pi
-    """Turn of each arc, rad"""
+    """Angle of each arc, rad"""
     tape_error: float = 0.002
     """Standard deviation of the taped distance, m"""
     speed: float = 0.12
@@ -119,9 +122,9 @@ class SonarWizard:
         config = context.config
         device = config.devices.sonar
         if device is None or not isinstance(device.driver, Srf08Config):
-            raise RequestRefusedError(Reason.NOT_SUPPORTED, "this robot has no array of sonars whose places it states")
+            raise RequestRefusedError(Reason.NOT_SUPPORTED, "this robot has no sonar array with configured mounts")
         if config.body.kind not in TURN_IN_A_METRE:
-            raise RequestRefusedError(Reason.NOT_SUPPORTED, f"body {config.body.kind}: its arcs are too wide")
+            raise RequestRefusedError(Reason.NOT_SUPPORTED, f"body {config.body.kind}: its smallest arcs are too wide")
         settings = device.driver
         await context.confirm(_PARK)
         wall = await context.ask(_WALL) + config.geometry.width / 2
@@ -155,38 +158,38 @@ class SonarWizard:
 
 
 def result_of(legs: Sequence[SonarLeg], settings: Srf08Config, wall: float, tape_error: float) -> Result:
-    """Fit and evaluate.
+    """Fit the parameters and check them.
 
     Args:
-        legs: driven, the first from where the robot was parked.
-        settings: that the daemon runs with.
-        wall: distance of the wall from the robot's middle, as taped, m.
-        tape_error: its standard deviation, m.
+        legs: driven arcs; the first starts where the robot was parked.
+        settings: sonar settings used by the daemon.
+        wall: taped distance of the wall from the robot's middle, m.
+        tape_error: standard deviation of ``wall``, m.
 
     Raises:
-        InputError: arcs to one side only, too few echoes, or swapped sonars.
+        InputError: arcs in one direction only, too few echoes, or swapped sonars.
     """
     headings = np.concatenate([p[:, 2] for leg in legs for p in leg.poses.values()] or [np.zeros(1)])
-    span = 1.0  # turn to each side, rad, at least
+    span = 1.0  # minimum turn in each direction, rad
     if headings.max() < span or headings.min() > -span:
-        raise InputError(f"expected arcs of {span:g} rad at least to both sides, with sonars that answer")
+        raise InputError(f"expected arcs of at least {span:g} rad in both directions, with echoes on the sonars")
     places = {n: SonarPose(*s.mount.planar) for n, s in settings.sonars.items()}
     _check_places(legs, places, wall, settings.field_of_view / 2)
     model = SonarModel(legs, settings, wall, tape_error)
     fit = model.fit()
     halves = known_errors(fit, model.kept.ranges.size - fit.parameters.size)
     if not np.isfinite(halves).all():
-        raise InputError("the arcs do not tell the sonars' places: one is off by more than a fit may find")
+        raise InputError("the arcs do not determine the sonars' poses: one result is outside the permitted range")
     found = [Interval(float(v), float(h)) for v, h in zip(fit.parameters, halves, strict=True)]
-    count, noise = model.kept.ranges.size, "95 % of ranges, odometry and tape"
+    count, noise = model.kept.ranges.size, "95 % interval from ranges, odometry and tape"
     sound = found[3].times(settings.speed_of_sound)
     estimates = [
-        estimated("cone", found[2].times(2.0), "rad", count, f"full opening angle, hard edges taken; {noise}",
+        estimated("cone", found[2].times(2.0), "rad", count, f"full opening angle, assuming hard edges; {noise}",
                   f"{SONAR}.field_of_view"),
-        estimated("speed_of_sound", sound, "m/s", count, f"that puts the wall at the taped distance; {noise}",
+        estimated("speed_of_sound", sound, "m/s", count, f"offset at which the wall is at the taped distance; {noise}",
                   f"{SONAR}.speed_of_sound"),
     ]  # fmt: skip
-    meanings = {"x": "ahead of the robot's middle", "y": "left of it", "yaw": "of its axis, left positive"}
+    meanings = {"x": "ahead of the robot's middle", "y": "to the left of it", "yaw": "of its axis, left positive"}
     for i, name in enumerate(model.order):
         base = model.first + 3 * i
         for j, (what, meaning) in enumerate(meanings.items()):
@@ -197,24 +200,26 @@ def result_of(legs: Sequence[SonarLeg], settings: Srf08Config, wall: float, tape
             )
     return Result(
         wizard="sonar",
-        measured=f"{len(legs)} arcs beside a wall, {count} echoes; residuals {fit.rms:.2f} of the expected noise",
+        measured=f"{len(legs)} arcs along a wall, {count} echoes; residuals {fit.rms:.2f} times the expected noise",
         estimates=tuple(estimates),
         unobserved=(
             "height and tilt of the cones",
-            "how a cone fades towards its edge: it is taken for a hard one",
+            "decrease of the sensitivity towards the edge of a cone: a hard edge is assumed",
             "the speed of sound at another temperature: 0.6 m/s for each degree Celsius",
         ),
     )
 
 
 def arc(chassis: Chassis, limit: float) -> tuple[float, float, float]:
-    """Axle angles of an arc to the left (rad), and its radius (m): by both axles of a truck, else by the front one."""
+    """Axle angles of an arc to the left (rad) and its radius (m).
+
+    With both axles of a truck, or the front axle of another body.
+    """
     angle = 0.35  # angle of both axles of a truck, in opposite directions, rad
     if isinstance(chassis, TruckChassis):
         angles = angle, -angle
     else:
-        # 0.96: share of the greatest angle that the gate allows
-        # 0.4: least radius of the arcs, m
+        # 0.96: fraction of the maximum angle that the gate allows 0.4: minimum radius of the arcs, m
         angles = min(0.96 * limit, math.atan((chassis.bicycle.l_f + chassis.bicycle.l_r) / 0.4)), 0.0
     return (*angles, 1.0 / float(chassis.bicycle.curvature(*angles)))
 
@@ -222,12 +227,12 @@ def arc(chassis: Chassis, limit: float) -> tuple[float, float, float]:
 def wall_range(
     poses: Array, place: SonarPose, wall: tuple[float | Array, float | Array], half: float
 ) -> tuple[Array, Array]:
-    """Range of a wall, m, and by how much its normal is past the cone's edge, rad; (n,) each.
+    """Range to a wall, m, and angle of its normal beyond the edge of the cone, rad; (n,) each.
 
     Args:
         poses: poses of the robot, (n, 3).
-        place: place of the sonar.
-        wall: distance from the origin (m), and by how much it is turned from the x axis to the right (rad).
+        place: pose of the sonar.
+        wall: distance from the origin (m), and clockwise angle from the x axis (rad).
         half: half angle of the cone, rad.
     """
     x, y, yaw = poses.T
@@ -241,10 +246,10 @@ def wall_range(
 
 
 def swings(poses: Array) -> Array:
-    """What turning by one rad more for each rad by odometry adds to the poses of an arc, to first order; (n, 3).
+    """Derivative of the poses of an arc with respect to the relative excess of its turn, to first order; (n, 3).
 
     Args:
-        poses: x, y (m) and yaw (rad) by odometry; (n, 3).
+        poses: odometry poses x, y (m) and yaw (rad); (n, 3).
     """
     yaw = poses[:, 2] - poses[0, 2]
     across = (yaw[1:] + yaw[:-1])[:, None] / 2 * np.diff(poses[:, :2], axis=0)
@@ -253,16 +258,16 @@ def swings(poses: Array) -> Array:
 
 
 class SonarModel:
-    """Ranges of a wall along arcs.
+    """Model of the ranges to a wall along arcs.
 
-    Parameters: ``COMMON``; for every arc the robot's shift towards the wall (m) and turn (rad) against odometry (not
-    for the first one), and the relative excess of its turn, in turn; x, y, yaw of every sonar.
+    Parameters: ``COMMON``; for every arc except the first the robot's shift towards the wall (m) and its turn (rad)
+    relative to odometry, and the relative excess of its turn; x, y, yaw of every sonar.
 
     Args:
-        legs: driven.
-        settings: that the daemon runs with.
-        wall: as taped, m.
-        tape_error: its standard deviation, m.
+        legs: driven arcs.
+        settings: sonar settings used by the daemon.
+        wall: taped distance of the wall, m.
+        tape_error: standard deviation of ``wall``, m.
     """
 
     def __init__(self, legs: Sequence[SonarLeg], settings: Srf08Config, wall: float, tape_error: float) -> None:
@@ -293,24 +298,24 @@ class SonarModel:
         self.kept = self._chosen(self._start, FIRST_RANGE_ERROR, 0.0)
 
     def samples(self, name: str) -> int:
-        """Echoes of a sonar from the wall."""
+        """Select a sonar's echoes from the wall."""
         return int((self.kept.sonars == self.order.index(name)).sum())
 
     def fit(self) -> FitResult:
-        """Solve by least squares: by the normals within the cones, then by their edges too, then without strays.
+        """Fit by least squares: first the normals within the cones, then also the edges, finally without outliers.
 
         Raises:
-            InputError: too few echoes of a sonar.
+            InputError: a sonar has too few echoes.
         """
         found = self._solve(self._start, edges=False)
-        sigmas = 4.0 * _sigma(self._echoes.ranges)  # the greatest error afterwards, in standard deviations
+        sigmas = 4.0 * _sigma(self._echoes.ranges)  # maximum residual in the final fit, in standard deviations
         for bounds in (FIRST_RANGE_ERROR / 2 + sigmas, sigmas):
             self.kept = self._chosen(found.parameters, bounds, BEYOND)
             found = self._solve(found.parameters)
         return found
 
     def _solve(self, start: Array, *, edges: bool = True) -> FitResult:
-        """Axes and cone stay as they are where no edges tell them."""
+        """Keep the axes and the cone where no edges determine them."""
         for name in self.order:
             if (count := self.samples(name)) < LEAST_ECHOES:
                 raise InputError(
@@ -322,7 +327,7 @@ class SonarModel:
         return least_squares(self._residual, start, self._start - reach, self._start + reach)
 
     def _predicted(self, parameters: Array, echoes: "_Echoes") -> tuple[Array, Array]:
-        """Ranges as the sonars measure them, m, and angle of the normal beyond the cone's edge, rad."""
+        """Predict the ranges of the sonars, m, and the angle of the normal beyond the edge of the cone, rad."""
         distance, direction, half, factor, scale = parameters[:COMMON].tolist()
         nearer, turned, swung = self._drift(parameters)[echoes.arcs].T
         x, y, yaw = parameters[self.first :].reshape(-1, 3)[echoes.sonars].T
@@ -335,7 +340,10 @@ class SonarModel:
         return np.concatenate((np.zeros(2), parameters[COMMON : self.first])).reshape(-1, len(ASSUMED.sonar_arc))
 
     def _drifted(self, drift: Array) -> Array:
-        """Drift as in ``ARC_DRIFT``: changes in nearer and turned since the last arc ended, and the share; (n, 3)."""
+        """Drift in units of ``ARC_DRIFT``.
+
+        Shift and turn since the end of the previous arc, and relative excess of the turn; (n, 3).
+        """
         nearer, turned, swung = drift.T
         ends = self._ends + swung[:, None] * self._swings
         at_end = nearer + np.sin(turned) * ends[:, 0] + np.cos(turned) * ends[:, 1]
@@ -357,7 +365,7 @@ class SonarModel:
         return np.concatenate((off, drift.ravel(), believed, [taped]))
 
     def _chosen(self, parameters: Array, bounds: Array | float, beyond: float) -> "_Echoes":
-        """The wall's echoes: within ``bounds`` (m) of the expected range, at most ``beyond`` (rad) the edge."""
+        """Select echoes at most ``bounds`` (m) from the wall's expected range and ``beyond`` (rad) past the cone."""
         due, past = self._predicted(parameters, self._echoes)
         near = np.abs(self._echoes.ranges - due) < bounds
         near &= (past <= beyond) & (due > self._limits[0]) & (due < self._limits[1])
@@ -371,18 +379,18 @@ class _Echoes(NamedTuple):
     arcs: NDArray[np.int64]
     sonars: NDArray[np.int64]
     poses: Array
-    """(3, n): x, y (m) and yaw (rad) of the robot"""
+    """x, y (m) and yaw (rad) of the robot, shape (3, n)"""
     swings: Array
-    """(3, n): as ``swings``"""
+    """Result of ``swings``, shape (3, n)"""
     ranges: Array
-    """m."""
+    """Measured range, m."""
 
 
 def _check_places(legs: Sequence[SonarLeg], places: Mapping[str, SonarPose], wall: float, half: float) -> None:
-    """Refuse a sonar that looks in a wrong direction, by the middle of the directions that hear the wall.
+    """Refuse a sonar with a wrong axis, judged by the middle of the directions in which it receives the wall.
 
     Raises:
-        InputError: cables or addresses are swapped, or a sonar hears no wall.
+        InputError: cables or addresses are swapped, or a sonar receives no wall.
     """
     wrong, deaf = [], []
     for name in places:
@@ -395,20 +403,25 @@ def _check_places(legs: Sequence[SonarLeg], places: Mapping[str, SonarPose], wal
             due = np.abs(wrap(bearings - place.yaw)) <= half + BEYOND
             off[at] = abs(wrap(mean_angle(bearings[near]) - mean_angle(bearings[due]))) if due.any() else math.pi
         nearest = min(off, key=lambda at: off[at])
-        # 0.4: maximum angle between the middles of the measured and of the expected echoes of any mount, rad
+        # 0.4: maximum angle between the middles of the measured and the expected echoes for any mount, rad
         if off[name] > 0.4 and nearest != name:
-            wrong.append(f"{name} hears the echoes due at {nearest}")
+            wrong.append(f"{name} receives the echoes expected at {nearest}")
     if deaf:
-        raise InputError(f"sonar {', '.join(deaf)}: too few echoes of the wall: is it where it was taped?")
+        raise InputError(
+            f"sonar {', '.join(deaf)}: too few echoes of the wall: check that it is mounted where configured"
+        )
     if wrong:
-        raise InputError(f"{', '.join(wrong)}: their addresses or cables are swapped, or left and right are")
+        raise InputError(f"{', '.join(wrong)}: check whether their addresses or cables, or left and right, are swapped")
 
 
 def _bearings(legs: Sequence[SonarLeg], name: str, wall: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Direction of the wall on the body at every ping, rad, and whether the sonar heard something as far off; (n,)."""
+    """Bearing of the wall in the body frame at every ping, rad, and whether the sonar measured a matching range.
+
+    (n,).
+    """
     poses = np.concatenate([leg.poses[name] for leg in legs if name in leg.poses] or [np.empty((0, 3))])
     ranges = np.concatenate([leg.ranges[name] for leg in legs if name in leg.poses] or [np.empty(0)])
-    # 0.3: greatest difference of a range from the wall's distance of the robot's middle, m
+    # 0.3: maximum difference between a range and the wall's distance from the robot's middle, m
     return math.pi / 2 - poses[:, 2], np.abs(ranges - (wall - poses[:, 1])) < 0.3
 
 
@@ -417,19 +430,19 @@ def _sigma(ranges: Array) -> Array:
 
 
 def _turned(record: MoveRecord) -> float:
-    """Turn by odometry, rad."""
+    """Turn measured by odometry, rad."""
     yaws = np.unwrap([o.pose.yaw for o in record.of(topics.ODOMETRY)])
     return float(yaws[-1] - yaws[0]) if yaws.size else 0.0
 
 
 def _start(record: MoveRecord) -> tuple[float, float, float]:
-    """Pose by odometry at rest before a move.
+    """Odometry pose at rest before a move.
 
     Raises:
-        InputError: none came.
+        InputError: no odometry was received.
     """
     resting = record.at_rest(topics.ODOMETRY)[0]
     if not resting:
-        raise InputError("no odometry came while the robot stood")
+        raise InputError("no odometry was received while the robot stood")
     pose = resting[-1].pose
     return pose.x, pose.y, pose.yaw

@@ -1,10 +1,11 @@
-"""Zero and direction of the two servos below the lidar, by the height of its beam and by its view of the floor.
+"""Zero and direction of the two servos below the lidar, from the height of its beam and its view of the floor.
 
-The levelling runs as always: it turns the joints against the tilt that the compass measures. On a level floor the
-height of the beam at its window, on a wall ahead and on one to the left gives the tilt of the lidar; minus the tilt of
-the body it is the true angle of the joints, so the positions of their servos give the zeros. On blocks a joint that
-turns the right way keeps the lidar level, and one that turns the wrong way doubles the body's tilt: then the beam meets
-the floor at the distance of twice the tilt. A joint that does not turn leaves it single, as do two that are swapped.
+The levelling runs as usual: it turns the joints against the tilt measured by the compass. On a level floor the heights
+of the beam at its window, on a wall ahead and on a wall to the left give the tilt of the lidar. Minus the tilt of the
+body, this is the true angle of the joints, so the positions of their servos give the zeros. With wheels on blocks, a
+joint that turns in the right direction keeps the lidar level. A joint that turns the wrong way doubles the tilt of the
+body, so the beam meets the floor at the distance for twice the tilt. A joint that does not turn leaves the single tilt,
+as do two swapped joints.
 """
 
 import math
@@ -33,20 +34,20 @@ from monstertruckd.tools.calibrate.steps import Collect, Confirm, Plot
 from monstertruckd.tools.calibrate.wizard import WizardContext
 
 ROOM: Final = (
-    "a level floor, a wall 2.5 to 3.5 m ahead of the robot and one to its left, nothing within 2.5 m ahead and to the "
-    "right; two blocks, 4 to 6 cm high"
+    "a level floor, a wall 2.5 to 3.5 m ahead of the robot and another to its left, no object within 2.5 "
+    "m ahead and to the right; two blocks, 4 to 6 cm high"
 )
 BLOCKS: Final = (math.radians(4.0), math.radians(15.0))
 """Tilt range of a body on blocks (rad)."""
 FOLLOWS: Final = math.radians(2.0)
-"""Maximum difference between a following joint and the tilt that it compensates, rad."""
+"""Maximum difference between the angle of a following joint and the tilt that it compensates, rad."""
 SECTOR: Final = math.radians(20.0)
 """Half angle of the sector where a tilted lidar meets the floor."""
 JOINTS: Final = ("pitch", "roll")
 
-_LEVEL: Final = Confirm("level", "Stand the robot on the level floor, wheels straight, and let go. Done?")
-_NOSE: Final = Confirm("nose", "Put the rear wheels on blocks, so that the nose is low, and let go. Done?")
-_SIDE: Final = Confirm("side", "Put the left wheels on blocks instead, so that the right side is low. Done?")
+_LEVEL: Final = Confirm("level", "Place the robot on the level floor, wheels straight, and let go. Done?")
+_NOSE: Final = Confirm("nose", "Put the rear wheels on blocks so that the nose is low, and let go. Done?")
+_SIDE: Final = Confirm("side", "Put the left wheels on blocks instead so that the right side is low. Done?")
 
 
 class RollPitch(NamedTuple):
@@ -67,20 +68,20 @@ class RestMeasurement:
     angles: Array
     """Angles of the beams, rad, left positive; (n,)"""
     ranges: Array
-    """Medians, m; inf = nothing; (n,)"""
+    """Median ranges, m; inf: no return; (n,)"""
 
     @classmethod
     def of(
         cls, scans: Sequence[LaserScan], tilts: Sequence[Attitude], joints: Sequence[StabiliserFeedback]
     ) -> "RestMeasurement":
-        """Build it from messages.
+        """Create it from messages.
 
         Raises:
             InputError: a servo does not answer.
         """
         read = [(j.pitch, j.roll) for j in joints if j.pitch is not None and j.roll is not None]
         if len(read) < len(joints) / 2:
-            raise InputError("a servo of the stabiliser does not answer")
+            raise InputError("a servo of the stabiliser does not answer: check its cable and power")
         pitch, roll = np.mean(np.array(read), axis=0).tolist()
         ranges, angles = stacked_ranges(scans, np.inf), bearings_of(scans[0])
         body = RollPitch(float(np.mean([a.pitch for a in tilts])), float(np.mean([a.roll for a in tilts])))
@@ -89,7 +90,7 @@ class RestMeasurement:
 
 @dataclass(frozen=True, slots=True)
 class Heights:
-    """Heights of the beam over the floor (m)."""
+    """Heights of the beam above the floor (m)."""
 
     centre: float
     ahead: float
@@ -98,10 +99,12 @@ class Heights:
 
 @dataclass(frozen=True, slots=True)
 class StabiliserWizard:
-    """Heights on the level floor; then blocks below the rear wheels, and below the left ones."""
+    """Wizard: heights on the level floor, then blocks below the rear wheels, then below the left wheels."""
 
     name: ClassVar[WizardName] = "stabiliser"
-    doc: ClassVar[str] = "zero and direction of both servos, from the height of the beam and blocks under wheels"
+    doc: ClassVar[str] = (
+        "zero and direction of both servos, from the height of the beam and from blocks under the wheels"
+    )
     room: ClassVar[str] = ROOM
     tape_error: float = ASSUMED.tape_reading
     """Standard deviation of a height, m"""
@@ -133,8 +136,8 @@ class StabiliserWizard:
     @staticmethod
     async def _stand(context: WizardContext) -> tuple[RestMeasurement, list[LaserScan]]:
         await context.collect(Collect("the robot comes to rest", topics.SCAN, 20))
-        scans = await context.collect(Collect("what the lidar sees", topics.SCAN, 10))
-        tilts = await context.collect(Collect("the robot's tilt", topics.COMPASS, 20))
+        scans = await context.collect(Collect("scans of the floor and the walls", topics.SCAN, 10))
+        tilts = await context.collect(Collect("tilt of the robot", topics.COMPASS, 20))
         joints = await context.collect(Collect("positions of the servos", topics.STABILISER, 20))
         return RestMeasurement.of(scans, tilts, joints), scans
 
@@ -148,19 +151,19 @@ def result_of(
     settings: Ax12Config,
     tape_error: float,
 ) -> Result:
-    """Judge.
+    """Compute zeros and directions, and check them.
 
     Args:
-        flat: on the level floor.
-        nose: with the nose low.
-        side: with the right side low.
+        flat: measurements on the level floor.
+        nose: measurements with the nose low.
+        side: measurements with the right side low.
         heights: heights of the beam.
-        walls: distances of the wall ahead and of the one to the left, m.
-        settings: that the daemon runs with.
+        walls: distances to the wall ahead and the wall to the left, m.
+        settings: settings used by the daemon.
         tape_error: standard deviation of a height, m.
 
     Raises:
-        InputError: heights that no lidar has; the blocks are missing, a joint does not follow, or the scans fit neither
+        InputError: impossible heights, missing blocks, a joint that does not follow, or scans that fit neither
             direction.
     """
     lies = RollPitch(*beam_tilt((heights.centre, heights.ahead, heights.left), walls))
@@ -171,7 +174,7 @@ def result_of(
     for axis, (name, joint, change) in enumerate(zip(JOINTS, joints, changes, strict=True)):
         direction = joint.direction * change
         position = joint.zero + joint.direction * flat.joints[axis] / STEP
-        # 0.3: standard deviation of a unit's position reading, steps: uniform over a step
+        # 0.3: standard deviation of a servo's position reading, steps: uniform over a step
         zero = Interval(
             position - direction * really[axis] / STEP,
             NORMAL * math.hypot(ASSUMED.beam_angle(tape_error, walls[axis]) / STEP, 0.3),
@@ -185,32 +188,33 @@ def result_of(
                 high=zero.high,
                 unit="steps",
                 samples=2,
-                meaning=f"position at which the lidar is parallel to the body; 95 % of two heights {walls[axis]:.1f} m "
-                "apart, and of the compass's tilt",
+                meaning="position at which the lidar is parallel to the body; 95 % interval from two heights "
+                f"{walls[axis]:.1f} m apart and the compass's tilt",
                 key=f"{STABILISER}.{name}.zero",
             ),
             Estimate(
                 name=f"{name}_direction",
                 value=direction,
                 samples=1,
-                meaning="+1: a rising position turns the joint positively; by the floor that the lidar sees, or not",
+                meaning="+1: a rising position turns the joint in the positive direction; found from the floor "
+                "seen by the lidar",
                 key=f"{STABILISER}.{name}.direction",
             ),
         ]
     turned = [name for name, change in zip(JOINTS, changes, strict=True) if change < 0]
-    again = f"{' and '.join(turned)} turned the wrong way: restart the daemon, and look whether the lidar is level then"
+    again = f"{' and '.join(turned)} turned the wrong way: restart the daemon and check that it then levels the lidar"
     return Result(
         wizard="stabiliser",
-        measured=f"heights of the beam; blocks of {math.degrees(nose.body.pitch):.0f} and "
+        measured=f"heights of the beam; blocks tilting the body by {math.degrees(nose.body.pitch):.0f} and "
         f"{math.degrees(side.body.roll):.0f} deg",
         estimates=tuple(estimates),
-        unobserved=("a lidar that sits askew on its mount: it looks like a zero that is off",),
+        unobserved=("a skewed lidar on its mount: it looks like a wrong zero",),
         again=again if turned else None,
     )
 
 
 def _turns(stand: RestMeasurement, flat: RestMeasurement, height: float, axis: int, really: RollPitch) -> int:
-    """+1 if a joint turns as its driver reports, -1 if it turns the other way.
+    """Return +1 if a joint turns as its driver reports, -1 if it turns the other way.
 
     Raises:
         InputError: see ``result_of``.
@@ -225,8 +229,9 @@ def _turns(stand: RestMeasurement, flat: RestMeasurement, height: float, axis: i
     moved = [s - f for s, f in zip(stand.joints, flat.joints, strict=True)]
     if abs(moved[axis] + tilt - flat.body[axis]) > FOLLOWS:
         raise InputError(
-            f"the {name} joint stands at {math.degrees(stand.joints[axis]):.0f} deg where "
-            f"{math.degrees(-tilt):.0f} would level the lidar: it does not follow; see `status` for the stabiliser"
+            f"the {name} joint is at {math.degrees(stand.joints[axis]):.0f} deg but "
+            f"{math.degrees(-tilt):.0f} deg would level the lidar: the joint does not follow; see the "
+            "stabiliser in `status`"
         )
     direction = (0.0, -math.pi / 2)[axis]
 
@@ -244,45 +249,48 @@ def _turns(stand: RestMeasurement, flat: RestMeasurement, height: float, axis: i
     turned, leaning = seen(wrong), seen(loose)
     if turned is None or leaning is None:
         raise InputError(
-            f"with the {low} low a lidar that leans would see the floor hardly nearer than what stands there: higher "
-            "blocks, or more room"
+            f"with the {low} low, a tilted lidar would see the floor at almost the same distance as the "
+            "objects there: use higher blocks or clear more floor"
         )
-    most = 0.6  # share of the beams of the sector that must be on the floor, for the lidar to look there
+    most = 0.6  # minimum fraction of the sector's beams on the floor if the lidar is tilted towards it
     if turned > most:
         return -1
     if leaning > most:
-        raise InputError(f"with the {low} low the lidar leans with the body: the horn of the {name} joint is loose")
+        raise InputError(f"with the {low} low, the lidar tilts with the body: the horn of the {name} joint is loose")
     if max(seen(joints) or 0.0 for joints in swapped) > most:
-        raise InputError(f"with the {low} low the lidar leans aside: pitch and roll servo are swapped (their ids)")
-    if max(turned, leaning) < 0.2:  # share that may be on the floor, for the lidar not to look there
+        raise InputError(
+            f"with the {low} low, the lidar tilts about the other axis: the ids of the pitch and roll servos "
+            "are swapped"
+        )
+    if max(turned, leaning) < 0.2:  # maximum fraction on the floor if the lidar is not tilted towards it
         return 1
     raise InputError(
-        f"with the {low} low the lidar sees neither a clear floor nor none: {turned:.0%} of its beams are where the "
-        "floor would be; nothing may stand there"
+        f"with the {low} low, {turned:.0%} of the lidar's beams end where the floor would be, so it is "
+        "unclear whether it sees the floor: remove all objects there"
     )
 
 
 def _on_floor(
     stand: RestMeasurement, flat: RestMeasurement, joints: RollPitch, height: float, direction: float
 ) -> float | None:
-    """Share of the beams around ``direction`` (rad) that measure the floor of a lidar with such joints (rad).
+    """Fraction of the beams around ``direction`` (rad) that measure the floor at these joint angles (rad).
 
-    None if it would be hardly nearer than the range of a level lidar there.
+    None if the floor would be at almost the same distance as the objects seen by a level lidar.
     """
     up = beams_up(stand.body, joints, stand.angles)
     floor = np.where(up < 0.0, height / np.maximum(-up, 1e-9), np.inf)
     sector: NDArray[np.bool_] = np.abs(stand.angles - direction) <= SECTOR
-    # 0.8: maximum distance of a clearly different floor, as a fraction of the range there
-    # 4.0: maximum distance of a visible floor, m
+    # 0.8: maximum distance of a distinguishable floor, as a fraction of the measured range 4.0: maximum distance of a
+    # visible floor, m
     due = sector & (floor < 0.8 * flat.ranges) & (floor < 4.0)
-    if due.sum() < max(10, sector.sum() / 4):  # beams in the sector
+    if due.sum() < max(10, sector.sum() / 4):  # minimum number of beams in the sector
         return None
     # 0.15: maximum relative difference between a range and the floor
     return float((np.abs(stand.ranges[due] / floor[due] - 1) < 0.15).mean())
 
 
 def beams_up(body: RollPitch, joints: RollPitch, angles: Array) -> Array:
-    """Rise of beams in the level frame, per metre: third row of Ry(p) Rx(r) Ry(a) Rx(b) on (cos, sin, 0); (n,)."""
+    """Rise of beams per metre in the level frame: third row of Ry(p) Rx(r) Ry(a) Rx(b) times (cos, sin, 0); (n,)."""
     ahead, left = plane_slopes(body.roll, body.pitch, joints.pitch, joints.roll)
     return np.asarray(np.cos(angles) * ahead + np.sin(angles) * left)
 
@@ -290,6 +298,6 @@ def beams_up(body: RollPitch, joints: RollPitch, angles: Array) -> Array:
 def _check_range(name: str, joint: JointConfig, zero: float) -> None:
     if not joint.min_position < round(zero) < joint.max_position:
         raise InputError(
-            f"the {name} joint is level at position {zero:.0f}, beyond its limits of {joint.min_position} to "
-            f"{joint.max_position}: put its horn on by some teeth"
+            f"the {name} joint is level at position {zero:.0f}, outside its limits of "
+            f"{joint.min_position} to {joint.max_position}: move its horn by some teeth"
         )

@@ -1,4 +1,4 @@
-"""Intervals from few measurements."""
+"""Confidence intervals from few measurements."""
 
 import math
 from dataclasses import dataclass
@@ -16,19 +16,19 @@ _T: Final = (
     2.201, 2.179, 2.160, 2.145, 2.131, 2.120, 2.110, 2.101, 2.093, 2.086,
     2.080, 2.074, 2.069, 2.064, 2.060, 2.056, 2.052, 2.048, 2.045, 2.042,
 )  # fmt: skip
-"""Student's t for 95 % both sides, by degrees of freedom from 1 on."""
+"""Two-sided 95 % quantiles of Student's t distribution, by degrees of freedom, starting with 1."""
 
 NORMAL: Final = 1.960
 
 
 def student(freedom: int) -> float:
-    """Half-width of a 95 % interval in standard errors, for a spread known from so many degrees of freedom.
+    """Half-width of a 95 % interval in standard errors, for a spread with this many degrees of freedom.
 
     Raises:
         ValueError: less than one degree of freedom.
     """
     if freedom < 1:
-        raise ValueError(f"freedom is {freedom}: expected at least 1")
+        raise ValueError(f"{freedom} degrees of freedom: expected at least 1")
     return _T[freedom - 1] if freedom <= len(_T) else NORMAL + 2.4 / freedom
 
 
@@ -50,7 +50,7 @@ class Interval:
         return self.value + self.half
 
     def widened(self, bound: float) -> "Interval":
-        """Widen by a systematic error of at most ``bound``, either way."""
+        """Widen by a systematic error of at most ``bound`` in either direction."""
         return Interval(self.value, self.half + bound)
 
     def joined(self, half: float) -> "Interval":
@@ -63,7 +63,7 @@ class Interval:
 
 
 def estimated(name: str, found: Interval, unit: str, samples: int, meaning: str, key: str | None = None) -> Estimate:
-    """An estimate by its interval; the rest as in ``Estimate``."""
+    """Create an estimate from its interval; other arguments as in ``Estimate``."""
     return Estimate(
         name=name,
         value=found.value,
@@ -77,7 +77,7 @@ def estimated(name: str, found: Interval, unit: str, samples: int, meaning: str,
 
 
 def mean_angle(angles: Array) -> float:
-    """Middle of directions, rad."""
+    """Circular mean of directions, rad."""
     return math.atan2(float(np.sin(angles).mean()), float(np.cos(angles).mean()))
 
 
@@ -86,8 +86,7 @@ def mean_interval(values: ArrayLike, least_error: float = 0.0) -> Interval:
 
     Args:
         values: (n,), n > 1.
-        least_error: standard deviation of one measurement that is known to be there, however well the values happen to
-            agree.
+        least_error: minimum standard deviation of one measurement, even if the values agree better.
     """
     data = np.asarray(values, dtype=np.float64)
     count = data.size
@@ -96,7 +95,7 @@ def mean_interval(values: ArrayLike, least_error: float = 0.0) -> Interval:
 
 
 def correlation_factor(residuals: Array) -> float:
-    """Inflation of a fit's standard error by slow errors: root of the integrated autocorrelation, at least 1.
+    """Inflation of a fit's standard error by correlated errors: root of the integrated autocorrelation, at least 1.
 
     The sum ends at the first correlation below zero (Sokal's window, simplified).
 
@@ -117,13 +116,13 @@ def correlation_factor(residuals: Array) -> float:
 
 
 def known_errors(fit: FitResult, freedom: int) -> Array:
-    """Half-widths of the parameters of a fit whose residuals are in units of errors known beforehand; (n,).
+    """Half-widths of the parameters of a fit whose residuals are in units of known errors; (n,).
 
-    Where the measurements disagree by more than those, their spread counts.
+    If the measurements disagree by more than the known errors, their spread is used.
 
     Args:
-        fit: of residuals over their standard deviations.
-        freedom: measurements, without priors, less parameters.
+        fit: fit of residuals divided by their standard deviations.
+        freedom: number of measurements, without priors, minus parameters.
     """
     power = float(np.sum(fit.residuals**2))
     unit = math.sqrt(power / max(1, fit.residuals.size - fit.parameters.size))

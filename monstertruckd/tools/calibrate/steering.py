@@ -1,7 +1,7 @@
 """Centre, direction, travel and pulse map of both steering servos.
 
-Hobby servos report nothing, so the truck itself is the instrument: the compass sees it turn, the drive measures its
-distance, and a string on the floor shows what neither sees, the crabbing of two axles that are off by the same angle.
+Hobby servos have no feedback, so the motion of the truck is the measurement: the compass measures its turn, the drive
+its distance, and a string on the floor shows what neither can see: crabbing, when both axles are off by the same angle.
 """
 
 import math
@@ -31,51 +31,54 @@ FULL: Final = 0.12
 ROOM: Final = "2.5 m x 2.5 m, level, the robot in the middle; with --rough 1.5 m x 1.5 m"
 
 ROUGH: Final = (0.06, 0.1, 0.4)
-"""Speed (m/s), axle angle (rad) and distance (m) of the first arcs: too little turn for the gate to call the steering
-dead, should it go the wrong way."""
+"""Speed (m/s), axle angle (rad) and distance (m) of the first arcs: even if the truck turns the wrong way, the turn is
+too small for the gate to report dead steering.
+"""
 
 DEAD_BAND: Final = 2.0
-"""Maximum pulse, us, that a servo stops short of its goal."""
+"""Maximum distance between a servo's final position and its set-point, us of pulse."""
 BAND: Final = NORMAL * DEAD_BAND / math.sqrt(3)
-"""The dead band as half a 95 % interval, us."""
+"""Dead band of the servo, as half a 95 % interval, us."""
 SPAN: Final = 50.0
-"""Degrees of the servo between full circles to the left and to the right."""
+"""Angle of the servo between full circles to the left and to the right, degrees."""
 SHORT: Final = math.radians(2.0)
-"""Shortfall of the servo angle from which a mechanical stop is assumed, rad; circles keep this far from the ends."""
+"""Shortfall of the servo angle above which a mechanical stop is assumed, rad; circles keep this distance from the
+ends.
+"""
 
 _TURNED: Final = Confirm(
-    "turned", "Steered to the left and driving ahead: did the robot turn to the LEFT, seen from above?", fact=True
+    "turned", "The robot steered left and drove ahead: did it turn LEFT, seen from above?", fact=True
 )
 _STRING: Final = Confirm(
-    "string", "Lay a string along the robot's left side, 2.5 m ahead, and mark the middle of that side on it. Done?"
+    "string", "Lay a string along the robot's left side and 2.5 m ahead, and mark the middle of that side on it. Done?"
 )
 _OFFSET: Final = Number(
-    "offset", "How far has the middle of the left side moved off the string's line, cm, left positive?", -60.0, 60.0
+    "offset", "How far is the middle of the left side from the string now, cm (left positive)?", -60.0, 60.0
 )
 SIDES: Final = ((1, "left"), (-1, "right"))
 CIRCLED: Final = (("the front", (1, 0)), ("the rear", (0, 1)), ("all", (1, -1)))
-"""Wheels that full circles are driven with, and which way each axle is steered then."""
+"""Axles used for full circles, with the steering direction of each."""
 
 
 @dataclass(frozen=True, slots=True)
 class SteeringWizard:
-    """Short arcs for the directions; then travel, straights along a string, full circles and weaves."""
+    """Wizard: short arcs for the directions; then travel, straights along a string, full circles and weaves."""
 
     name: ClassVar[WizardName] = "steering"
     doc: ClassVar[str] = "centre, direction, travel and pulses of both axles, from the robot's turns and a string"
     room: ClassVar[str] = ROOM
     rough: bool = False
-    """Directions and a first centre only: before the compass is calibrated"""
+    """Determine directions and rough centres only, before the compass is calibrated"""
     strings: int = 3
     """Straight runs along a string; 0 without a string"""
     string_error: float = ASSUMED.string_direction
     """Standard deviation of the string's direction along the truck, rad: 1.4 mm on 0.4 m"""
     weaves: int = 3
-    """Times the truck weaves ahead and back, for dead time and lag"""
+    """Number of weaves ahead and back, for dead time and lag"""
 
     @property
     def moves(self) -> int:
-        """How often the truck moves: arcs; then arcs and travel, straights, circles and weaves."""
+        """Number of moves: arcs only, or arcs, travel, straights, circles and weaves."""
         arcs = 2 * len(SIDES) * len(AXLES)
         return arcs if self.rough else 3 * arcs + 2 * self._lines + len(CIRCLED) * len(SIDES) + 2 * self.weaves
 
@@ -87,7 +90,7 @@ class SteeringWizard:
         """Measure."""
         chassis = context.chassis
         if not isinstance(chassis, TruckChassis):
-            raise RequestRefusedError(Reason.NOT_SUPPORTED, "only the truck's two steered axles are calibrated so far")
+            raise RequestRefusedError(Reason.NOT_SUPPORTED, "only the truck's two steered axles can be calibrated")
         maps, model = Maps.of(context.config), SteeringModel(chassis)
         await context.confirm(CLEAR)
         context.expect(self.moves)
@@ -96,11 +99,14 @@ class SteeringWizard:
         start = Maps(maps.centres, (maps.scales[0] * directions[0], maps.scales[1] * directions[1]), maps.deficit)
         wrong = [name for name, sign in zip(AXLES, directions, strict=True) if sign < 0]
         if self.rough or wrong:
-            senses = f"the {' and '.join(wrong)} wheels steered the other way than configured, which is corrected then"
+            senses = (
+                f"the {' and '.join(wrong)} wheels steered opposite to the configured direction; the "
+                "calibration corrects this"
+            )
             again = f"restart the daemon and run the wizard again: {senses}"
             if len(wrong) == len(AXLES):
                 await self._check_compass(context)
-                again += "; swapped cables look the same: do the FRONT wheels turn when the front ones are steered?"
+                again += "; swapped cables look the same: do the FRONT wheels turn when the front axle is steered?"
             return context.fit("centres", lambda: _rough(arcs, model, start, again if wrong else None))
         legs = [leg for axle in await self._arcs(context, maps, (0.12, 0.18, 1.0)) for leg in axle]
         first = Maps.from_parameters(model.fit([*arcs[0], *arcs[1], *legs], start).parameters)
@@ -124,24 +130,26 @@ class SteeringWizard:
 
     @staticmethod
     async def _check_compass(context: WizardContext) -> None:
-        """The compass indicates that both axles steer the other way: the operator checks whether the compass is wrong.
+        """The compass reports that both axles steer the wrong way: ask the operator whether the compass is wrong.
 
         Raises:
-            InputError: it is.
+            InputError: the compass is wrong.
         """
         speed, angle, metres = ROUGH
-        await context.move(MoveStep("front wheels left again, to see where it turns", speed, angle, 0.0, metres))
+        await context.move(
+            MoveStep("front wheels left again, to see the direction of the turn", speed, angle, 0.0, metres)
+        )
         if await context.confirm(_TURNED):
             raise InputError(
-                "the robot turns as it is steered, and the compass the other way: it is mounted upside down, or its "
-                "heading has the wrong sign; nothing was saved"
+                "the robot turns as steered but the compass reports the opposite: the compass is upside "
+                "down, or its heading has the wrong sign; nothing was saved"
             )
 
     @staticmethod
     async def _arcs(
         context: WizardContext, maps: Maps, arc: tuple[float, float, float]
     ) -> tuple[list[SteeringRun], list[SteeringRun]]:
-        """Arcs to both sides, forward and back, with the front axle and with the rear one."""
+        """Drive arcs in both directions, forward and back, with the front axle and with the rear axle."""
         speed, angle, metres = arc
         found: tuple[list[SteeringRun], list[SteeringRun]] = ([], [])
         for axle, name in enumerate(AXLES):
@@ -155,8 +163,8 @@ class SteeringWizard:
 
     @staticmethod
     async def _travel(context: WizardContext, maps: Maps, model: SteeringModel, first: Maps) -> "list[AxleTravel]":
-        """How far each axle follows to each side."""
-        speed, metres = (0.1, 0.6)  # speed and length of arcs with the wheels as far over as the gate lets them
+        """Find how far each axle follows to each side."""
+        speed, metres = (0.1, 0.6)  # speed and length of arcs with the wheels as far over as the gate allows
         limit = context.config.gate.angle
         reached = []
         for axle, name in enumerate(AXLES):
@@ -164,13 +172,13 @@ class SteeringWizard:
                 front, rear = _steered(axle, sign * limit)
                 legs = []
                 for direction in (1, -1):
-                    move = MoveStep(f"{name} wheels far {side}", direction * speed, front, rear, metres)
+                    move = MoveStep(f"{name} wheels fully {side}", direction * speed, front, rear, metres)
                     legs.append(SteeringRun.of(await context.move(move), maps))
                 reached.append(AxleTravel.of(axle, sign, legs, model, first))
         return reached
 
     async def _straights(self, context: WizardContext, maps: Maps) -> list[SteeringRun]:
-        """Straight ahead and back, the wheels set from one side and from the other."""
+        """Drive straight ahead and back, with the wheels set from the left and from the right."""
         speed, metres = (0.12, 2.0)  # m/s, m
         legs = []
         approach = 0.2
@@ -191,9 +199,9 @@ class SteeringWizard:
     async def _circles(
         context: WizardContext, maps: Maps, model: SteeringModel, first: Maps, travel: "list[AxleTravel]"
     ) -> list[SteeringRun]:
-        """A full turn to each side with each axle and with both, which no slow error of the compass can falsify.
+        """Drive a full turn in each direction with each axle and with both; no slow compass error can falsify it.
 
-        The wheels are turned as far as they follow; the ``first`` maps give the command for that.
+        The wheels are turned as far as they follow; the ``first`` maps give the command.
         """
         ends = {(reach.axle, reach.sign): reach.sign * (abs(reach.servo) - SHORT) for reach in travel}
         legs = []
@@ -202,7 +210,7 @@ class SteeringWizard:
                 servos = [ends.get((axle, sign * sense), 0.0) for axle, sense in enumerate(steered)]
                 front, rear = model.commands(servos, first, maps)
                 move = MoveStep(
-                    f"a full circle by {wheels} wheels, {side}",
+                    f"a full circle with {wheels} wheels, {side}",
                     FULL,
                     front,
                     rear,
@@ -226,8 +234,8 @@ class SteeringWizard:
         travel = [AxleTravel.of(reach.axle, reach.sign, reach.legs, model, maps) for reach in travel]
         # 0.003: relative error of a taped wheelbase
         halves, share = half_widths(fit), _distance_error(context) + 0.003
-        eye = "" if self.strings else "; errors common to both axles by eye and circles alone"
-        band = f"95 % of the legs' noise, and the servo's dead band of {DEAD_BAND:g} us"
+        eye = "" if self.strings else "; errors common to both axles are determined by eye and from circles only"
+        band = f"95 % interval from the noise of the legs and the servo's dead band of {DEAD_BAND:g} us"
         estimates: list[Estimate] = []
         for axle, name in enumerate(AXLES):
             centre, scale = (float(value) for value in fit.parameters[2 * axle : 2 * axle + 2])
@@ -242,7 +250,7 @@ class SteeringWizard:
                     high=abs(scale) * (1 + share) + math.hypot(scale_half, BAND / SPAN),
                     unit="us/deg",
                     samples=len(legs),
-                    meaning=f"pulse per degree of the servo; {band}, and {share:.1%} of distance and wheelbase",
+                    meaning=f"pulse per degree of the servo; {band}, and {share:.1%} for distance and wheelbase",
                     key=f"{STEERING}.{name}.scale_us_per_deg",
                 ),
             ]
@@ -254,39 +262,44 @@ class SteeringWizard:
         strings = f"along {self.strings} strings" if self.strings else "without a string"
         return Result(
             wizard="steering",
-            measured=f"{len(legs)} legs: arcs with one axle, full circles with one and with both, straights {strings}",
+            measured=f"{len(legs)} legs: arcs with one axle, full circles with one and both axles, straights {strings}",
             estimates=tuple(estimates),
             unobserved=(
-                "the wheelbase, whose error shows as scale, and the linkage but for what its turns lack",
-                "travel beyond the limits of gate and servo",
-                "an error of devices.compass.driver.delay, which shows as dead time of the steering",
-                *(() if self.strings else ("equal errors of both centres, but by unlike circles: the robot crabs",)),
+                "the wheelbase (its error appears as a scale error), and the linkage except for its "
+                "measured lack of turning",
+                "travel beyond the limits of the gate and the servo",
+                "an error of devices.compass.driver.delay, which appears as dead time of the steering",
+                *(
+                    ()
+                    if self.strings
+                    else ("equal errors of both centres, except through unequal circles: the robot crabs",)
+                ),
             ),
         )
 
 
 @dataclass(frozen=True, slots=True)
 class AxleTravel:
-    """How far an axle follows to one side."""
+    """Reach of an axle to one side."""
 
     axle: int
     sign: int
-    """+1 left."""
+    """Side: +1 left, -1 right."""
     servo: float
     """Servo angle reached, rad."""
     axle_angle: float
-    """The axle's angle then, rad."""
+    """Axle angle at this servo angle, rad."""
     stopped: bool
-    """Something stopped it there, short of its pulse."""
+    """Whether a mechanical stop ended the travel before the set-point."""
 
     half: float
-    """Half the 95 % interval of that, rad."""
+    """Half the 95 % interval of the axle angle, rad."""
     legs: tuple[SteeringRun, ...]
     """Arcs with the wheels far over."""
 
     @classmethod
     def of(cls, axle: int, sign: int, legs: Sequence[SteeringRun], model: SteeringModel, maps: Maps) -> "AxleTravel":
-        """Samples from arcs with strongly turned wheels, as far as ``maps`` give the angle of the other axle."""
+        """Return samples from arcs with strongly turned wheels, as far as ``maps`` give the angle of the other axle."""
         reached, meant = np.array([model.reached(leg, maps, axle) for leg in legs]).mean(axis=0).tolist()
         stopped = sign * (meant - reached) > SHORT
         servo = reached if stopped else meant
@@ -297,9 +310,9 @@ class AxleTravel:
         return cls(axle, sign, servo, angle, stopped, half, tuple(legs))
 
     def estimates(self, name: str, centre: float, scale: float, before: Result | None) -> list[Estimate]:
-        """Text about it, and the limit of the pulse, us, where something stops the wheels.
+        """Description of the reach, and the pulse limit, us, if there is a mechanical stop.
 
-        A limit set ``before`` hides the stop behind it, and stays.
+        A pulse limit set ``before`` hides the stop behind it, and is kept.
         """
         side, end = "left" if self.sign > 0 else "right", "max_us" if self.sign * scale > 0 else "min_us"
         value, half = math.degrees(self.axle_angle), math.degrees(self.half)
@@ -310,12 +323,13 @@ class AxleTravel:
             high=value + half if self.stopped else None,
             unit="deg",
             samples=2,
-            meaning="axle angle at which something stops the wheels; 95 % of the legs' noise and 2 % of scale"
+            meaning="axle angle at which the wheels reach a mechanical stop; 95 % interval from the noise of the "
+            "legs and 2 % of scale"
             if self.stopped
-            else "axle angle that the wheels follow to; the limits of gate and servo allow no more",
+            else "maximum axle angle that the wheels reached; gate and servo limit it further",
         )
         limit = None if before is None else before.estimate(f"{name}_{end}")
-        margin = 1.0  # degrees of servo angle kept from a stop: a servo that pushes against one burns
+        margin = 1.0  # distance kept from a stop, degrees of servo angle: a servo that pushes against a stop burns out
         if self.stopped:
             degrees = math.degrees(self.servo) - self.sign * margin
             limit = Estimate(
@@ -323,33 +337,33 @@ class AxleTravel:
                 value=centre + scale * degrees,
                 unit="us",
                 samples=2,
-                meaning=f"limit of the pulse, {margin:g} deg of the servo before its stop",
+                meaning=f"limit of the pulse, {margin:g} deg of servo angle before the stop",
                 key=f"{STEERING}.{name}.{end}",
             )
         return [travel] if limit is None else [travel, limit]
 
 
 def _steered(axle: int, angle: float) -> tuple[float, float]:
-    """Angles of front and rear axle, rad, with one of them steered."""
+    """Angles of the front and rear axle, rad, if only one of them is steered."""
     return (angle, 0.0) if axle == 0 else (0.0, angle)
 
 
 def steered_senses(arcs: tuple[list[SteeringRun], list[SteeringRun]]) -> tuple[int, int]:
-    """+1 where an axle steers as commanded, -1 where it steers the other way.
+    """Return for each axle +1 if it steers as commanded, -1 if it steers the other way.
 
     Raises:
         InputError: an axle does not turn the truck.
     """
     signs = []
     for axle, legs in enumerate(arcs):
-        # Left forward, left back, right forward, right back: the common part of both sides belongs to the centre.
+        # Left forward, left back, right forward, right back: the part common to both sides is the centre error.
         pattern = np.array((1, -1, -1, 1)) * (1 if axle == 0 else -1)
         turn = float(pattern @ [leg.turn for leg in legs]) / 4
         error = math.hypot(*(leg.sigma for leg in legs)) / 4
-        if abs(turn) < 5.0 * error:  # standard errors of a turn that make its direction sure
+        if abs(turn) < 5.0 * error:  # number of standard errors of a turn that make its direction certain
             raise InputError(
-                f"{AXLES[axle]} wheels: steered, they turn the robot by {math.degrees(turn):.2f} deg only: "
-                "a servo without supply, or on another channel?"
+                f"{AXLES[axle]} wheels: steering them turned the robot by only {math.degrees(turn):.2f} "
+                "deg: check the servo's supply and channel"
             )
         signs.append(1 if turn > 0 else -1)
     return signs[0], signs[1]
@@ -358,29 +372,32 @@ def steered_senses(arcs: tuple[list[SteeringRun], list[SteeringRun]]) -> tuple[i
 def _rough(
     arcs: tuple[list[SteeringRun], list[SteeringRun]], model: SteeringModel, start: Maps, again: str | None
 ) -> Result:
-    """Directions, and centres as far as they show before compass and drive are calibrated.
+    """Directions and rough centres, before compass and drive are calibrated.
 
     Args:
-        arcs: driven.
+        arcs: driven arcs.
         model: model of the truck.
-        start: configured maps, with the directions found.
+        start: configured maps with the measured directions.
         again: remaining steps.
     """
     legs = [*arcs[0], *arcs[1]]
     fit = model.fit(legs, start)
     halves = half_widths(fit)
     estimates = []
-    unscaled = 0.5  # share of a turn that may be wrong before compass and drive are calibrated
+    unscaled = 0.5  # relative error of a turn before compass and drive are calibrated
     for axle, name in enumerate(AXLES):
         centre, scale = (float(value) for value in fit.parameters[2 * axle : 2 * axle + 2])
         half = float(halves[2 * axle]) + unscaled * abs(centre - start.centres[axle])
-        meaning = f"rough: 95 % of the legs' noise, and {unscaled:.0%} of the correction for compass and drive"
+        meaning = (
+            f"rough: 95 % interval from the noise of the legs, and {unscaled:.0%} of the correction for "
+            "compass and drive"
+        )
         estimates += [_direction(name, scale, len(legs)), _centre(name, centre, half, len(legs), meaning)]
     return Result(
         wizard="steering",
-        measured=f"{len(legs)} short arcs with one axle at a time",
+        measured=f"{len(legs)} short arcs, one axle at a time",
         estimates=tuple(estimates),
-        unobserved=("pulse per degree and travel", "equal errors of both centres, but by the eye"),
+        unobserved=("pulse per degree and travel", "equal errors of both centres, except by eye"),
         partial=True,
         again=again,
     )
@@ -391,7 +408,7 @@ def _direction(name: str, scale: float, samples: int) -> Estimate:
         name=f"{name}_direction",
         value=1 if scale > 0 else -1,
         samples=samples,
-        meaning="+1: a longer pulse steers left; by the sense in which the robot turned",
+        meaning="+1: a longer pulse steers left; found from the direction in which the robot turned",
         key=f"{STEERING}.{name}.direction",
     )
 
@@ -402,25 +419,26 @@ def _centre(name: str, centre: float, half: float, samples: int, meaning: str) -
 
 
 def _deficits(maps: Maps, halves: Array, samples: int, band: str) -> list[Estimate]:
-    """Deficit of the turns.
+    """Estimates of the turn deficit.
 
     Args:
-        maps: fitted.
+        maps: fitted maps.
         halves: half the 95 % intervals; (6,).
-        samples: legs.
+        samples: number of legs.
         band: coverage of the intervals.
     """
     return [
         estimated(
             f"deficit_{name}", Interval(value, float(half)), "", samples,
-            f"what the turns lack by the linkage, {name.replace('_', ' ')}; {band}", f"body.turn_deficit.{name}",
+            f"turns fall short of the linkage by this share, {name.replace('_', ' ')}; {band}",
+            f"body.turn_deficit.{name}",
         )
         for (name, value), half in zip(asdict(maps.deficit).items(), halves, strict=True)
     ]  # fmt: skip
 
 
 def _distance_error(context: WizardContext) -> float:
-    """Relative error of the counted distance."""
+    """Relative error of the measured distance."""
     drive = context.known.get("drive")
     ratio = None if drive is None else drive.estimate("turns_per_metre")
     if ratio is None or ratio.low is None or ratio.high is None:

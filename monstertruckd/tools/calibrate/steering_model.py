@@ -1,9 +1,9 @@
-"""Model between pulses and the truck's turns: the fit behind the steering wizard.
+"""Model of the truck's turns as a function of the servo pulses: the fit of the steering wizard.
 
-Both axles are steered, so a turn shows the difference of their angles only: wz = v_x (tan front - tan rear) / L.
-Driving arcs with one axle at a time shows the gain of each, and straight driving the difference of their centres. Equal
-errors of both centres make the truck crab without turning, which no compass sees: they show as a sideways offset from a
-string, and faintly as unlike circles to the left and to the right, if the linkage is modelled correctly.
+Both axles are steered, so a turn depends only on the difference of their angles: wz = v_x (tan front - tan rear) / L.
+Arcs with one axle at a time determine the gain of each, straight runs the difference of their centres. Equal errors of
+both centres make the truck crab without turning, which the compass cannot see. They appear as a sideways offset from a
+string and, if the linkage model is correct, as a small difference between circles to the left and to the right.
 """
 
 import itertools
@@ -30,23 +30,26 @@ Axle = Literal["front", "rear"]
 AXLES: Final[tuple[Axle, Axle]] = ("front", "rear")
 
 EYE: Final = math.radians(3.0)
-"""Servo angle, rad, within which straight wheels look straight: without a string the only word on a common error."""
+"""Maximum servo angle of wheels that look straight, rad: without a string the only bound on a common error."""
 
 
 @dataclass(frozen=True, slots=True)
 class Maps:
-    """Pulse maps of both servos: pulse = centre + scale * servo angle in degrees; scales carry the direction's sign."""
+    """Pulse maps of both servos: pulse = centre + scale * servo angle in degrees.
+
+    The sign of the scale is the direction.
+    """
 
     centres: tuple[float, float]
-    """Front and rear, us."""
+    """Centres, front and rear, us."""
     scales: tuple[float, float]
-    """Front and rear, us per degree."""
+    """Scales, front and rear, us per degree."""
     deficit: TurnDeficit = field(default_factory=TurnDeficit)
-    """Turn that the axles lack compared with the linkage."""
+    """Shortfall of the turn compared with the linkage."""
 
     @classmethod
     def of(cls, config: TruckConfig) -> "Maps":
-        """Build it as configured.
+        """Create it from the configuration.
 
         Raises:
             InputError: the truck has no steering.
@@ -65,47 +68,47 @@ class Maps:
 
     @classmethod
     def from_parameters(cls, parameters: Array) -> "Maps":
-        """Build it from (front centre, front scale, rear centre, rear scale) and the fields of the deficit."""
+        """Create it from (front centre, front scale, rear centre, rear scale) and the fields of the deficit."""
         front, front_scale, rear, rear_scale, *deficit = (float(value) for value in parameters)
         return cls((front, rear), (front_scale, rear_scale), TurnDeficit(*deficit))
 
     @property
     def parameters(self) -> Array:
-        """(10,), see ``from_parameters``."""
+        """Parameter vector, shape (10,); see ``from_parameters``."""
         pulses = self.centres[0], self.scales[0], self.centres[1], self.scales[1]
         return np.array((*pulses, *astuple(self.deficit)))
 
     def pulses(self, axle: int, servo: Array) -> Array:
-        """Pulses, us, that the daemon sends for servo angles, rad."""
+        """Pulses sent by the daemon for servo angles (rad), us."""
         return np.asarray(self.centres[axle] + self.scales[axle] * np.degrees(servo))
 
     def servo(self, axle: int, pulses: Array) -> Array:
-        """Servo angles of pulses, rad, cut to the linkage's range."""
+        """Servo angles for pulses, rad, limited to the range of the linkage."""
         angles = np.radians((pulses - self.centres[axle]) / self.scales[axle])
         return np.asarray(np.clip(angles, -SERVO_LIMIT, SERVO_LIMIT))
 
 
 @dataclass(frozen=True, slots=True)
 class SteeringRun:
-    """One move, ready for the fit."""
+    """One move, prepared for the fit."""
 
     motor: Array
-    """Turned between readings, rad; (n,)."""
+    """Motor rotation between readings, rad; (n,)."""
     pulses: tuple[Array, Array]
-    """Pulses of the front and rear servo meanwhile, us; (n,) each."""
+    """Pulses of the front and rear servo at that time, us; (n,) each."""
     turn: float
-    """Measured between the rests, rad, left positive."""
+    """Turn measured between the rests, rad, left positive."""
     sigma: float
-    """Its standard deviation, rad."""
+    """Standard deviation of ``turned``, rad."""
     offset: float | None = None
-    """Measured sideways from the string at the end, m, left positive."""
+    """Offset from the string at the end, m, left positive; None if not measured."""
     offset_sigma: float = 0.01
 
     @classmethod
     def of(
         cls, track: MoveRecord, maps: Maps, offset: float | None = None, offset_sigma: float = 0.01
     ) -> "SteeringRun":
-        """Build it from a move, driven with the daemon's maps."""
+        """Create it from a move driven with the daemon's maps."""
         motor, *servos = track.steps()
         turn, noise = track.turn()
         part = abs(math.remainder(turn, 2 * math.pi))
@@ -117,7 +120,7 @@ class SteeringRun:
 
 
 class SteeringModel:
-    """The truck as the fit sees it.
+    """Kinematic model of the truck for the fit.
 
     Args:
         chassis: linkage, wheelbase, drive.
@@ -133,16 +136,16 @@ class SteeringModel:
         return replace(self._linkage, deficit=maps.deficit)
 
     def axle_angle(self, axle: int, servo: float, maps: Maps) -> float:
-        """Angle, rad, of an axle at its servo angle, with the other axle straight."""
+        """Angle of an axle at its servo angle, with the other axle straight, rad."""
         return self.axles(maps).angles(*((servo, 0.0) if axle == 0 else (0.0, servo)))[axle]
 
     def commands(self, servos: Sequence[float], true: Maps, configured: Maps) -> tuple[float, float]:
-        """Axle angles, rad, to command of a daemon with the maps ``configured`` for servo angles, rad, by ``true``."""
+        """Axle angles (rad) to command of a daemon with ``configured`` maps, for true servo angles (rad)."""
         front, rear = (float(configured.servo(i, true.pulses(i, np.array(servo)))) for i, servo in enumerate(servos))
         return self.axles(configured).angles(front, rear)
 
     def predict(self, legs: Sequence[SteeringRun], maps: Maps) -> tuple[Array, Array]:
-        """Turns, rad, and sideways offsets, m, left positive, of legs; (n,) each."""
+        """Predict turns (rad) and sideways offsets (m) of legs, left positive; (n,) each."""
         sizes = [leg.motor.size for leg in legs]
         starts = list(itertools.accumulate(sizes[:-1], initial=0))
         motor = np.concatenate([leg.motor for leg in legs])
@@ -156,17 +159,17 @@ class SteeringModel:
         return turns, np.add.reduceat(forward * np.sin(heading) + sideways * np.cos(heading), starts)
 
     def distance(self, leg: SteeringRun) -> float:
-        """Distance rolled on a leg, m."""
+        """Distance travelled on a leg, m."""
         return float(np.abs(self.chassis.drivetrain.distance(leg.motor)).sum())
 
-    # 0.15: maximum relative difference of a pulse map from the configured one, before anything is measured
+    # 0.15: maximum relative difference between a pulse map and the configured one before the measurement
     def fit(self, legs: Sequence[SteeringRun], start: Maps, gain: float = 0.15) -> FitResult:
-        """Pulse maps that explain all legs; parameters as ``Maps.parameters``.
+        """Fit the pulse maps to all legs; parameters as in ``Maps.parameters``.
 
         Args:
-            legs: driven.
-            start: first guess, directions right.
-            gain: share within which the scales are known beforehand.
+            legs: driven legs.
+            start: first guess, with correct directions.
+            gain: relative prior uncertainty of the scales.
         """
         guess = start.parameters
         sigmas = np.array([ASSUMED.turn_of_leg(leg.sigma, self.distance(leg)) for leg in legs])
@@ -176,7 +179,7 @@ class SteeringModel:
         def residual(parameters: Array) -> Array:
             turned, aside = self.predict(legs, Maps.from_parameters(parameters))
             off = np.radians((parameters[[0, 2]] - guess[[0, 2]]) / guess[[1, 3]])
-            # 0.3: standard deviation of a coefficient of the turn deficit before it is measured: 5 % of the turn at
+            # 0.3: standard deviation of a coefficient of the turn deficit before the measurement: 5 % of the turn at
             # full lock
             return np.array(
                 (
@@ -192,9 +195,9 @@ class SteeringModel:
         return least_squares(residual, guess, guess - spread, guess + spread)
 
     def reached(self, leg: SteeringRun, maps: Maps, axle: int) -> tuple[float, float]:
-        """Servo angle, rad, that an axle really had on a leg by the turn, and the one its pulses mean.
+        """Return the true servo angle of an axle on a leg, from the turn, and the angle that its pulses command, rad.
 
-        The other axle is taken as the maps have it. Valid for a leg with steady steering.
+        The other axle is assumed to follow the maps. Valid for a leg with constant steering.
         """
         axles = self.axles(maps)
         bicycle, sense = self.chassis.bicycle, 1.0 if axle == 0 else -1.0
@@ -214,13 +217,13 @@ class SteeringModel:
 
 
 def half_widths(fit: FitResult, priors: int = 9) -> Array:
-    """Half the 95 % intervals of the parameters.
+    """Half-widths of the parameters' 95 % intervals.
 
-    The errors of a leg are known beforehand; where the legs disagree by more, their spread counts.
+    The errors of a leg are known beforehand; if the legs disagree by more, their spread is used.
 
     Args:
-        fit: of ``SteeringModel.fit``.
-        priors: residuals of priors, not of measurements.
+        fit: result of ``SteeringModel.fit``.
+        priors: number of residuals that are priors, not measurements.
     """
     freedom = fit.residuals.size - priors - fit.parameters.size
     spread = math.sqrt(float(np.sum(fit.residuals**2)) / max(1, fit.residuals.size - fit.parameters.size))

@@ -1,4 +1,4 @@
-"""Steps of a wizard: requests to the operator and the truck, and the readings recorded during a move."""
+"""Steps of a wizard: questions to the operator, moves of the truck, and the readings recorded during a move."""
 
 import itertools
 import math
@@ -22,7 +22,7 @@ M = TypeVar("M", bound=Message)
 
 @dataclass(slots=True)
 class MoveRecord:
-    """Readings of one move, rests at both ends included."""
+    """Readings of one move, including the rests at both ends."""
 
     drive: list[DriveFeedback] = field(default_factory=list)
     steering: list[SteeringFeedback] = field(default_factory=list)
@@ -79,20 +79,20 @@ class MoveRecord:
         before, after = headings[stamps < self.left], headings[stamps > self.arrived]
         if min(before.size, after.size) < 5:
             raise InputError(
-                f"only {before.size} and {after.size} headings of the compass at rest: expected 5 at each end; "
-                "`monstertruckd status` says whether it is silent"
+                f"only {before.size} and {after.size} compass headings at rest: expected 5 at each end; "
+                "`monstertruckd status` shows whether the compass is silent"
             )
         noise = math.hypot(*(float(rest.std(ddof=1)) / math.sqrt(rest.size) for rest in (before, after)))
         return float(before.mean() - after.mean()), noise
 
     def currents_at(self, stamps: Array) -> Array:
-        """Motor current (A) at instants (ns); 0 where the nearest reading is half a second or more away; (n,)."""
+        """Motor current (A) at the given times (ns); 0 if the nearest reading is half a second or more away; (n,)."""
         known = [(reading.stamp, reading.current) for reading in self.drive if reading.current is not None]
         if not known:
             return np.zeros(stamps.shape)
         times, values = np.array(known, dtype=np.float64).T
         nearest = np.abs(times[:, None] - stamps[None, :]).min(axis=0)
-        # 0.5: validity of a motor current (s): not every feedback carries one
+        # 0.5: validity of a motor current (s): not every feedback contains one
         return np.where(nearest < 0.5 * SECOND, np.interp(stamps, times, values), 0.0)
 
     def steps(self) -> tuple[Array, Array, Array]:
@@ -110,37 +110,38 @@ class MoveRecord:
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """A value that the operator reads off a tape or a meter."""
+    """A value that the operator reads from a tape or a meter."""
 
     name: str
-    """Short name, for answers given beforehand"""
+    """Short name, for answers given in advance"""
     question: str
     """The question, with the expected unit"""
     low: float
     high: float
-    """Upper bound. A value out of bounds is asked again, or refused if it was given beforehand"""
+    """Upper bound. The wizard asks again for a value out of bounds, or refuses it if it was given in advance"""
 
 
 @dataclass(frozen=True, slots=True)
 class Confirm:
-    """A question that the operator confirms: an action done, or an observation."""
+    """A confirmation by the operator: an action done, or an observation."""
 
     name: str
     question: str
     fact: bool = False
-    """The answer decides the measurement, so ``--yes`` does not give it; otherwise any answer but yes ends it"""
+    """Whether the answer decides the measurement, so that ``--yes`` does not give it; otherwise any answer but yes ends
+    the wizard
+    """
 
 
 @dataclass(frozen=True, slots=True)
 class MoveStep:
     """A drive from rest to rest, with fixed or weaving steering; the truck is disarmed before and after.
 
-    The wheels are turned while the truck stands. It rests for a moment at both ends, so that readings there can be
-    averaged.
+    The wheels turn while the truck stands. It rests for a moment at both ends, so that readings there can be averaged.
     """
 
     name: str
-    """Purpose, in a word or two"""
+    """Purpose, in one or two words"""
     speed: float
     """Speed (m/s), negative backwards"""
     front: float = 0.0
@@ -151,7 +152,7 @@ class MoveStep:
     rest: float = 1.0
     """Standstill at each end (s)"""
     approach: float = 0.0
-    """Axle angle before the wheels turn to their set-point (rad): servos stop short of their goal"""
+    """Axle angle set before the final angle (rad), because servos stop short of their set-point"""
     weave: tuple[float, ...] = ()
     """Times between sign changes of the axle angles during the drive, repeated cyclically (s); empty: no changes"""
     done: Callable[[MoveRecord], bool] | None = None
@@ -159,10 +160,10 @@ class MoveStep:
     also: tuple[Topic[Any], ...] = ()
     """Additional topics to record"""
     marked: bool = False
-    """The operator measures from the start point, so the move cannot restart once the truck has moved"""
+    """Whether the operator measures from the start, so that the move cannot be repeated once the truck has moved"""
 
     def back(self, distance: float) -> "MoveStep":
-        """Return the move back over the first ``distance`` (m); straight back for a weaving move."""
+        """Return the reverse of the move over ``distance`` (m); straight back for a weaving move."""
         back = replace(self, name=f"{self.name}, back", speed=-self.speed, metres=distance, done=None, also=())
         return replace(back, front=0.0, rear=0.0, weave=()) if self.weave else back
 
@@ -197,7 +198,7 @@ class WatchStep(Generic[M]):
     name: str
     topic: Topic[M]
     take: Callable[[M, dict[str, list[Any]]], tuple[float, float]]
-    """Gets a message, and the messages of ``also`` since the last call, by topic; returns progress and total"""
+    """Called with a message and the messages of ``also`` since the last call, by topic; returns progress and total"""
     also: tuple[Topic[Any], ...] = ()
     timeout: float = 10.0
     """Timeout without a message (s)"""
@@ -234,7 +235,7 @@ class Panel(Protocol):
         """Ask for a number.
 
         Raises:
-            InputError: there is no answer.
+            InputError: no answer is available.
         """
 
     async def confirm(self, step: Confirm) -> bool:

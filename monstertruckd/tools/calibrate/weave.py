@@ -1,12 +1,12 @@
-"""Dead time and lag of the steering, from a weaving truck: the gate's commands against the turns of the compass.
+"""Dead time and lag of the steering from a weaving truck: the gate's commands against the turns of the compass.
 
-The integral of the lagged curvature, times the speed, is the turn that the compass should see. Each weave has its own
-gain (the linkage may turn less than it should) and trim (the axles may be off centre).
+The integral of the lagged curvature times the speed is the expected turn of the compass. Each weave has its own gain
+(the linkage may turn less than expected) and trim (the axles may be off centre).
 
-The unit's accelerometers mistake starting (2 degrees in the first 0.1 s at speed) and turning (0.1 degrees to either
-side) for tilt. A field that is levelled by such a tilt turns the heading by half as much again, by where north is,
-which looks like another delay and less lag. So headings are computed from the field with one tilt for the whole weave;
-the floor is level.
+The accelerometers of the compass mistake starting (2 degrees in the first 0.1 s at speed) and turning (0.1 degrees to
+either side) for tilt. Levelling the field by such a tilt changes the heading by half as much again, depending on the
+direction of north, which looks like another delay and less lag. So headings are computed from the field with one tilt
+for the whole weave; the floor is level.
 """
 
 from collections.abc import Iterable, Sequence
@@ -29,14 +29,14 @@ from monstertruckd.tools.calibrate.response import ResponseFit, Steps, unexplain
 from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
 
 ANGLE: Final = 0.12
-"""Small, so that the curvature is about linear in it."""
+"""Small axle angle, for which the curvature is almost linear, rad."""
 
 
 def weaves(rounds: int) -> list[MoveStep]:
-    """Forward and back, in turn."""
+    """Number of weaves, alternately forward and back."""
     return [
-        # Seconds between changes of side: many changes determine the lag, and a long arc the gain, which has a
-        # similar effect where changes follow each other evenly.
+        # Seconds between changes of side: many changes determine the lag, a long arc the gain. Evenly spaced changes
+        # could not separate them.
         MoveStep(f"weaving {direction}", sign * 0.15, ANGLE, -ANGLE, 1.8, weave=(0.3, 0.3, 0.3, 0.3, 1.2))  # m
         for _ in range(rounds)
         for sign, direction in ((1, "ahead"), (-1, "back"))
@@ -45,31 +45,31 @@ def weaves(rounds: int) -> list[MoveStep]:
 
 @dataclass(frozen=True, slots=True)
 class Weave:
-    """One weaving move, ready for the fit."""
+    """One weaving move, prepared for the fit."""
 
     curvature: Steps
-    """Commanded, 1/m."""
+    """Commanded curvature, 1/m."""
     times: Array
     """Times of the headings, s; (n,)."""
     distances: Array
-    """Distances rolled until then, m; (n,)."""
+    """Distances travelled until these times, m; (n,)."""
     stride: int
-    """Headings from one to the one it is compared with."""
+    """Number of headings between two that are compared."""
     turns: Array
-    """Measured between those, rad; (n - stride,)."""
+    """Turns measured between compared headings, rad; (n - stride,)."""
 
     @classmethod
     def of(cls, record: MoveRecord, chassis: TruckChassis, iron: IronConfig) -> Self | None:
-        """Build it from readings at speed; None if they are too few to compare headings."""
+        """Create it from readings at speed; None if they are too few."""
         times = np.array([reading.stamp for reading in record.drive]) / SECOND
         speeds = np.abs([reading.velocity for reading in record.drive])
-        # 0.9: minimum fraction of the maximum speed of a truck that neither starts nor stops
+        # 0.9: minimum fraction of the maximum speed for readings apart from start and stop
         steady = times[speeds >= 0.9 * speeds.max(initial=0.0)]
         if not (record.steering_commands and steady.size):
             return None
         seen = [reading for reading in record.attitude if steady[0] <= reading.stamp / SECOND <= steady[-1]]
         at = np.array([reading.stamp for reading in seen]) / SECOND
-        # Seconds between two headings that are compared, about as long as the steering keeps to one side.
+        # Seconds between two compared headings, about as long as the steering stays on one side.
         stride = max(round(0.3 * (at.size - 1) / float(at[-1] - at[0])), 1) if at.size > 1 else 1
         if at.size <= stride:
             return None
@@ -86,7 +86,7 @@ class Weave:
         )
 
     def residuals(self, delay: float, squared: float) -> Array:
-        """Turns that remain unexplained, rad, whatever gain and trim are; arguments as ``Steps.integral``."""
+        """Residuals of the turns for the best gain and trim, rad; arguments as for ``Steps.integral``."""
         turned = (
             np.diff(self.curvature.integral(self.times, delay, squared)) / np.diff(self.times) * np.diff(self.distances)
         )
@@ -97,10 +97,10 @@ class Weave:
 
 
 def steady_headings(readings: Sequence[Attitude], iron: IronConfig) -> Array:
-    """Headings of a body that keeps its tilt, whatever its accelerometers feel: clockwise, rad, unwrapped; (n,).
+    """Headings of a body with constant tilt, whatever its accelerometers report: clockwise, rad, unwrapped; (n,).
 
     Args:
-        readings: in their order; where one has no field, the unit's own headings are taken.
+        readings: readings in order; without a field, the heading of the compass is used.
         iron: magnetic calibration of the unit.
     """
     fields = [(field.x, field.y, field.z) for reading in readings if (field := reading.magnetic_field) is not None]
@@ -113,19 +113,19 @@ def steady_headings(readings: Sequence[Attitude], iron: IronConfig) -> Array:
 
 
 def response(records: Iterable[MoveRecord], chassis: TruckChassis, iron: IronConfig) -> ResponseFit:
-    """Dead time and lag of the axles behind the commands.
+    """Fit dead time and lag of the axles relative to the commands.
 
     Args:
         records: records of weaves.
-        chassis: for the turns that commands mean.
-        iron: magnetic calibration that the compass runs with.
+        chassis: kinematics, for the turns expected from commands.
+        iron: magnetic calibration used by the compass driver.
 
     Raises:
-        InputError: too few turns were seen.
+        InputError: too few turns were measured.
     """
     seen = [weave for record in records if (weave := Weave.of(record, chassis, iron)) is not None]
     samples = sum(weave.turns.size for weave in seen)
-    least = 60  # turns that dead time and lag have to rest on
+    least = 60  # minimum number of turns to fit dead time and lag
     if samples < least:
         raise InputError(f"only {samples} turns determine dead time and lag: expected {least}")
 
@@ -136,14 +136,14 @@ def response(records: Iterable[MoveRecord], chassis: TruckChassis, iron: IronCon
 
 
 def estimates(found: ResponseFit) -> list[Estimate]:
-    """Saved form."""
+    """Estimates as saved."""
     meanings = (
         "from a command to the first movement of the wheels",
         "time constant of the turning wheels",
-        "dead time and lag together",
+        "dead time plus lag",
     )
     covers = (
-        f"95 % of the compass's noise, a linkage 2 % from linear, "
-        f"and {2000 * ASSUMED.servo_wait:g} ms of waiting for a pulse"
+        "95 % interval from the compass's noise, a linkage nonlinearity of 2 %, and "
+        f"{2000 * ASSUMED.servo_wait:g} ms of waiting for a pulse"
     )
     return found.estimates(meanings, covers, key=STEERING)

@@ -1,9 +1,9 @@
 """Calibration wizards: coroutines that lead the operator through typed steps.
 
 A wizard awaits the steps of its ``WizardContext`` one by one: ask for a number, ask for a confirmation, move, collect
-messages, fit. It can be cancelled at every step: the truck moves within ``move`` only and is disarmed between moves;
-nothing is written before the wizard has returned its result. An interrupt, a lost link or a killed process leaves
-the calibration unchanged; the gate stops the truck as it does for any operator whose requests end.
+messages, fit. It can be cancelled at every step. The truck moves within ``move`` only and is disarmed between moves,
+and nothing is written before the wizard returns its result. An interrupt, a lost link or a killed process leaves the
+calibration unchanged; the gate stops the truck as for any operator whose requests end.
 """
 
 import json
@@ -32,7 +32,7 @@ from monstertruckd.tools.calibrate.steps import Collect, Confirm, MoveRecord, Mo
 M = TypeVar("M", bound=Message)
 T = TypeVar("T")
 
-CLEAR: Final = Confirm("clear", "The robot is about to move. Is the floor free as described?")
+CLEAR: Final = Confirm("clear", "The robot is about to move. Is the floor clear as described?")
 
 
 class Wizard(Protocol):
@@ -49,12 +49,12 @@ class Wizard(Protocol):
 
 
 class WizardContext:
-    """The steps of one wizard, and its data of the truck.
+    """Steps of one wizard, and its data of the truck.
 
     Args:
-        truck: link to it.
-        panel: the operator.
-        clock: time.
+        truck: link to the truck.
+        panel: interface to the operator.
+        clock: source of time.
         config: configuration of the daemon, calibration included.
         known: the truck's calibration so far, by wizard; expired results, and results of another part, are ignored.
     """
@@ -90,7 +90,7 @@ class WizardContext:
         self._panel.plot(plot)
 
     def value(self, key: str) -> Value:
-        """A value of the daemon's configuration.
+        """Return a value of the daemon's configuration.
 
         Raises:
             InputError: this truck has no such device.
@@ -104,7 +104,7 @@ class WizardContext:
         """Ask for a number within its bounds.
 
         Raises:
-            InputError: there is no usable answer.
+            InputError: no usable answer is available.
         """
         value = await self._panel.number(step)
         if not step.low <= value <= step.high:
@@ -112,11 +112,11 @@ class WizardContext:
         return value
 
     async def confirm(self, step: Confirm) -> bool:
-        """Yes or no.
+        """Ask for a confirmation; return the answer.
 
         Raises:
             RequestRefusedError: the operator declined a required step.
-            InputError: there is no answer.
+            InputError: no answer is available.
         """
         yes = await self._panel.confirm(step)
         if not yes and not step.fact:
@@ -124,11 +124,11 @@ class WizardContext:
         return yes
 
     def expect(self, moves: int) -> None:
-        """Say with each of the next ``moves`` moves which of them it is."""
+        """Number the next ``moves`` moves in the messages to the operator."""
         self._moves, self._moved = moves, 0
 
     async def move(self, step: MoveStep) -> MoveRecord:
-        """Drive; raises as ``Mover.move`` does."""
+        """Drive; raises the errors of ``Mover.move``."""
         self._moved += 1
         which = f" ({self._moved} of {self._moves})" if self._moved <= self._moves else ""
         self._panel.say(f"moving{which}: {step.name}")
@@ -144,10 +144,10 @@ class WizardContext:
         return await self._mover.move(step, report, self._panel.say)
 
     async def collect(self, step: Collect[M]) -> list[M]:
-        """Messages of a topic.
+        """Collect messages of a topic.
 
         Raises:
-            NoAnswerError: they did not come in time.
+            NoAnswerError: too few were received in time.
         """
         found: list[M] = []
         with self._truck.subscribe(step.topic, fifo(step.count)) as messages:
@@ -157,25 +157,25 @@ class WizardContext:
                         found.append(await messages.next())
                         self._panel.progress(step.name, len(found), step.count)
             except TimeoutError:
-                text = f"{step.topic.name}: {len(found)} of {step.count} messages came within {step.timeout:g} s"
+                text = f"{step.topic.name}: {len(found)} of {step.count} messages received within {step.timeout:g} s"
                 raise NoAnswerError(text) from None
         return found
 
     async def watch(self, step: WatchStep[M]) -> None:
-        """Messages as they come, until enough was seen; raises what ``step.take`` does.
+        """Follow messages until ``step.take`` has seen enough; raises its errors.
 
         Raises:
-            NoAnswerError: none came in time.
+            NoAnswerError: no message was received in time.
         """
         with ExitStack() as feeds:
             newest = feeds.enter_context(self._truck.subscribe(step.topic, latest()))
-            # 64: messages kept between two looks
+            # 64: maximum number of messages kept between two calls
             others = {t.name: feeds.enter_context(self._truck.subscribe(t, fifo(64))) for t in step.also}
             done, total = 0.0, 1.0
             while done < total:
                 message = await newest.next_within(step.timeout)
                 if message is None:
-                    raise NoAnswerError(f"{step.topic.name}: no message came for {step.timeout:g} s")
+                    raise NoAnswerError(f"{step.topic.name}: no message received for {step.timeout:g} s")
                 done, total = step.take(message, {name: box.drain() for name, box in others.items()})
                 self._panel.progress(step.name, done, total)
 
@@ -183,14 +183,14 @@ class WizardContext:
         """Compute a result from the measurements, as a separate step.
 
         Raises:
-            InputError: there is none, as the measurements do not determine it; and errors of ``function``.
+            InputError: the measurements do not determine a result; and errors of ``function``.
         """
         self._panel.say(f"computing: {name}")
         try:
             return function()
-        except (ValueError, ArithmeticError) as error:  # of pydantic, numpy and least squares, too
+        except (ValueError, ArithmeticError) as error:  # includes errors of pydantic, numpy and least squares
             text = str(error).splitlines()[0]
-            raise InputError(f"{name}: cannot be computed from what was measured ({text}): measure again") from error
+            raise InputError(f"{name}: cannot be computed from the measurement ({text}): measure again") from error
 
 
 async def calibrate(
@@ -201,7 +201,7 @@ async def calibrate(
     config: TruckConfig,
     known: Mapping[WizardName, Result],
 ) -> tuple[Result, str]:
-    """Run a wizard and have the daemon save its result; returns what ``save`` does.
+    """Run a wizard and let the daemon save its result; return the value of ``save``.
 
     Raises:
         TruckError: the wizard ended without a result; nothing was saved.
@@ -217,24 +217,24 @@ async def measure(
     config: TruckConfig,
     known: Mapping[WizardName, Result],
 ) -> Result:
-    """Run a wizard; nothing is saved. Raises TruckError if it ended without a result."""
+    """Run a wizard without saving. Raises TruckError if it ended without a result."""
     panel.say(f"{wizard.name}: {wizard.doc}")
     if wizard.room:
         panel.say(f"room: {wizard.room}")
     context = WizardContext(truck, panel, clock, config, known)
     if why := context.expired.get(wizard.name):
-        panel.say(f"nothing of the calibration before is used, it has expired: {why}")
+        panel.say(f"the previous calibration is ignored because it has expired: {why}")
     return await wizard(context)
 
 
 async def save(truck: TruckClient, result: Result) -> tuple[Result, str]:
-    """Have the daemon save a result; returns it as it was saved, and the path of the new file."""
+    """Let the daemon save a result; return the saved result and the path of the new file."""
     saved = await truck.call(SAVE, {"result": result.model_dump(mode="json"), "source": truck.source})
     return Result.model_validate_json(json.dumps(saved["result"])), str(saved["file"])
 
 
 def missing(config: TruckConfig, results: Mapping[str, Result], expired: Collection[str] = ()) -> list[WizardRun]:
-    """Return the runs of wizards that a robot still needs, in an order that lets each use the results before it.
+    """Return the runs of wizards that a robot still needs, ordered so that each can use earlier results.
 
     Args:
         config: configuration of the robot.

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from monstertruck_runtime.clock import Clock
     from monstertruckd.tools.cli.runs import RunEnd
 
-app = command_group("Behaviours: motion in reaction to sensors, without a path, such as following a wall.")
+app = command_group("Behaviours: motion controlled directly by sensors, without a path, such as wall following.")
 
 NameArgument = Annotated[str, typer.Argument(help="Name in the configuration.", show_default=False)]
 WITHOUT = "has no behaviours"
@@ -25,7 +25,7 @@ WITHOUT = "has no behaviours"
 def list_command(
     robot: RobotOption = "truck", endpoint: EndpointOption = DEFAULT_ENDPOINT, json_output: JsonOption = False
 ) -> None:
-    """Print the behaviours that the robot's configuration has."""
+    """Print the configured behaviours of the robot."""
 
     async def main(client: "TruckClient", _: "Clock") -> dict[str, Any]:
         try:
@@ -41,18 +41,18 @@ def list_command(
     elif found:
         print_table(("name", "kind", "what it does"), [(name, row["kind"], row["doc"]) for name, row in found.items()])
     else:
-        print("none: expected a section `behaviours` in the robot's configuration")
+        print("none: add a section `behaviours` to the robot's configuration")
 
 
 @app.command("start")
 def start_command(
     name: NameArgument,
-    arm: Annotated[bool, typer.Option("--arm", help="Arm the robot first; it drives off at once.")] = False,
+    arm: Annotated[bool, typer.Option("--arm", help="Arm the robot first; it starts to drive at once.")] = False,
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
     json_output: JsonOption = False,
 ) -> None:
-    """Start a behaviour and follow it to its end, whose reason is the exit code. Ctrl-C stops it."""
+    """Start a behaviour and follow it to its end; the exit code is the reason of the end. Ctrl-C stops it."""
     from monstertruckd.tools.cli.runs import run_behaviour
 
     async def main(client: "TruckClient", _: "Clock") -> "RunEnd":
@@ -67,7 +67,7 @@ def start_command(
 
 @app.command("stop")
 def stop_command(robot: RobotOption = "truck", endpoint: EndpointOption = DEFAULT_ENDPOINT) -> None:
-    """Stop the behaviour that runs."""
+    """Stop the running behaviour."""
     from monstertruck_schemas.req import BehaviourOrder
 
     async def main(client: "TruckClient", _: "Clock") -> None:

@@ -1,4 +1,4 @@
-"""``monstertruckd calibrate``: the wizards, their results so far, and undo."""
+"""``monstertruckd calibrate``: the wizards, their results, and undo."""
 
 import inspect
 import sys
@@ -35,21 +35,30 @@ if TYPE_CHECKING:
     from monstertruckd.tools.calibrate.steps import Panel
     from monstertruckd.tools.calibrate.wizard import Wizard
 
-app = command_group("Calibrate this robot: guided, step by step; Ctrl-C gives up at any step.")
+app = command_group("Calibrate this robot with guided steps; Ctrl-C cancels any step.")
 
 ANSWER_TIMEOUT: Final = 10.0
-"""Seconds to wait for the link and for answers."""
+"""Timeout for the link and for answers (s)."""
 
-YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Answer yes wherever something is to be done.")]
+YesOption = Annotated[
+    bool, typer.Option("--yes", "-y", help="Answer yes to every question that asks whether something is done.")
+]
 AnswerOption = Annotated[
     list[str] | None,
-    typer.Option("--answer", "-a", metavar="NAME=VALUE", help="Answer beforehand; repeated in the order of asking."),
+    typer.Option(
+        "--answer",
+        "-a",
+        metavar="NAME=VALUE",
+        help="Answer a question in advance; repeat the option in the order of the questions.",
+    ),
 ]
-UndoOption = Annotated[bool, typer.Option("--undo", help="Go back to what held before the last run; twice is redo.")]
+UndoOption = Annotated[
+    bool, typer.Option("--undo", help="Restore the values from before the last run; a second undo redoes.")
+]
 FileOption = Annotated[
     Path | None,
     typer.Option(
-        "--config", "-c", help="With --undo and show: this configuration's files, without a daemon.",
+        "--config", "-c", help="With --undo and show: use this configuration's files, without a daemon.",
         autocompletion=complete_config, callback=bundled,
     ),
 ]  # fmt: skip
@@ -57,7 +66,7 @@ FileOption = Annotated[
 
 @dataclass(frozen=True)
 class _Call:
-    """Options of every wizard's command."""
+    """Options common to all wizards."""
 
     robot: str
     endpoint: str
@@ -66,7 +75,7 @@ class _Call:
 
 
 def _add_command(kind: WizardKind) -> None:
-    """Add the command of a wizard, with its own options and those that all share."""
+    """Add the command of a wizard, with its own and the common options."""
 
     def command(
         *,
@@ -98,7 +107,7 @@ def _add_command(kind: WizardKind) -> None:
 
 
 def _parameter(option: WizardOption) -> inspect.Parameter:
-    """An option as a parameter of a command; of a flag there is no opposite."""
+    """Declare an option as a parameter of a command; a flag has no opposite."""
     name, kind = option.name, type(option.default)
     flags = (f"--{name.replace('_', '-')}",) if kind is bool else ()
     limits = {} if kind in (bool, str) else {"min": option.low, "max": option.high}
@@ -107,10 +116,10 @@ def _parameter(option: WizardOption) -> inspect.Parameter:
 
 
 def _made(kind: WizardKind, given: "Mapping[str, Any]") -> "Wizard":
-    """The wizard with these options.
+    """Create the wizard with these options.
 
     Raises:
-        InputError: an option is none of its choices, or they do not fit together.
+        InputError: an option is not one of its choices, or options are inconsistent.
     """
     from monstertruck_runtime.errors import InputError
 
@@ -138,9 +147,9 @@ def all_(
 ) -> None:
     """Run every wizard that this robot still needs, in order; valid results are skipped.
 
-    Without a stabiliser, which has its own wizard, the lidar's asks the heights of the beam, too.
+    On a robot without a stabiliser the lidar wizard also asks for the heights of the beam.
 
-    After each, restart the daemon: this command waits for it and continues. If you end it half-way, it resumes with the
+    Restart the daemon after each wizard: this command waits for it and continues. If interrupted, it resumes with the
     remaining wizards.
     """
     from monstertruck_runtime.clock import run_wall
@@ -155,19 +164,19 @@ def all_(
                 print(f"still to be calibrated: {names}" if names else "everything is calibrated, nothing expired")
                 return
             if waiting:
-                remark("restart the daemon, to apply the measurement; this command then continues (Ctrl-C ends it)")
+                remark("restart the daemon to apply the measurement; this command then continues (Ctrl-C ends it)")
                 run_wall(lambda clock: _until_restarted(call, clock))
                 continue
             _run(wizard_of(steps[0]), call, panel)
 
 
 def wizard_of(run: WizardRun, given: "Mapping[str, Any]" = MappingProxyType({})) -> "Wizard":
-    """The wizard of a run of ``calibrate all``, with its own defaults where an option is not given."""
+    """Create the wizard of a run of ``calibrate all``, with its own defaults for missing options."""
     return _made(run.wizard, {**run.step.options, **given})
 
 
 async def _steps_left(call: _Call, clock: "Clock") -> "tuple[list[WizardRun], bool]":
-    """Steps that are still to be done, and whether the daemon runs on an older calibration than there is."""
+    """Return the remaining steps, and whether the daemon uses an older calibration than the latest one."""
     from monstertruck_schemas.topics import CALIBRATION
     from monstertruckd.config.calibration_rpc import SHOW
     from monstertruckd.tools.calibrate.wizard import missing
@@ -191,7 +200,7 @@ async def _until_restarted(call: _Call, clock: "Clock") -> None:
             if not (await _steps_left(call, clock))[1]:
                 return
         except (NoAnswerError, NotFoundError):
-            pass  # it is being restarted
+            pass  # the daemon is being restarted
         await clock.sleep(1.0)
 
 
@@ -227,18 +236,18 @@ def show(
         _print(result)
     remark(f"file: {state['newest']} ({file.change})")
     if keys := state.get("unused"):
-        remark(f"not used, as the configuration has no such part: {', '.join(keys)}")
+        remark(f"ignored, because the configuration has no such part: {', '.join(keys)}")
     if "loaded" in state and state["loaded"] != state["newest"]:
-        remark(f"the daemon still runs on {state['loaded'] or 'no calibration'}: restart it")
+        remark(f"the daemon still uses {state['loaded'] or 'no calibration'}: restart it")
 
 
 @app.command()
 def accept(
     robot: RobotOption = "truck", endpoint: EndpointOption = DEFAULT_ENDPOINT, json_output: JsonOption = False
 ) -> None:
-    """Save the tracker's estimate of the steering as its calibration; `show` prints it before.
+    """Save the tracker's estimate of the steering as a calibration; `calibrate show` prints it.
 
-    The robot must be disarmed. `calibrate steering --undo` takes it back.
+    The robot must be disarmed. `calibrate steering --undo` reverts it.
     """
     from monstertruck_runtime.errors import NotFoundError
     from monstertruckd.config.calibration_rpc import SAVE, SHOW
@@ -246,7 +255,7 @@ def accept(
     async def save(client: "TruckClient", _: "Clock") -> "tuple[Result, str]":
         proposed = _proposed(await client.call(SHOW))
         if proposed is None:
-            raise NotFoundError("no calibration is proposed: the tracker has found nothing that differs for certain")
+            raise NotFoundError("no calibration is proposed: the tracker has found no significant difference")
         payload = {"result": proposed.model_dump(mode="json"), "source": client.source}
         return proposed, (await client.call(SAVE, payload))["file"]
 
@@ -255,7 +264,7 @@ def accept(
         print_json({"result": result, "file": file})
     else:
         _print(result)
-    remark(f"saved in {file}; it applies from the next start of the daemon")
+    remark(f"saved in {file}; the daemon applies it at its next start")
 
 
 def _run(wizard: "Wizard", call: _Call, panel: "Panel") -> None:
@@ -266,7 +275,7 @@ def _run(wizard: "Wizard", call: _Call, panel: "Panel") -> None:
         print_json({"result": result, "file": file})
     else:
         _print(result)
-    remark(f"saved in {file}; it applies from the next start of the daemon")
+    remark(f"saved in {file}; the daemon applies it at its next start")
     if result.again is not None:
         remark(f"next: {result.again}")
 
@@ -299,7 +308,7 @@ def _undo(name: str, call: _Call) -> None:
         )["file"]
     if call.json_output:
         print_json({"file": file})
-    remark(f"{name}: as before, in {file}; it applies from the next start of the daemon")
+    remark(f"{name}: previous values restored in {file}; the daemon applies them at its next start")
 
 
 def _client(robot: str, endpoint: str, clock: "Clock") -> "TruckClient":
@@ -309,7 +318,7 @@ def _client(robot: str, endpoint: str, clock: "Clock") -> "TruckClient":
 
 
 def _store(config: Path) -> "tuple[TruckConfig, CalibrationStore]":
-    """The configuration without calibration, and where its robot's calibration is."""
+    """Return the uncalibrated configuration, and the folder of its robot's calibration."""
     from monstertruckd.config.calibration import CalibrationStore
     from monstertruckd.config.load import load_config
     from monstertruckd.config.truck import TruckConfig
@@ -319,7 +328,7 @@ def _store(config: Path) -> "tuple[TruckConfig, CalibrationStore]":
 
 
 def file_in(state: dict[str, Any]) -> "CalibrationFile | None":
-    """The newest file of a robot that answers with ``state``."""
+    """Return the latest file of a robot that answered with ``state``."""
     import json
 
     from monstertruckd.config.calibration import CalibrationFile
@@ -329,7 +338,7 @@ def file_in(state: dict[str, Any]) -> "CalibrationFile | None":
 
 
 def _proposed(state: dict[str, Any]) -> "Result | None":
-    """The calibration that a robot's tracker proposes; older robots and files alone have none."""
+    """Return the calibration proposed by a robot's tracker; older robots and files have none."""
     import json
 
     from monstertruckd.config.calibration import Result
@@ -339,7 +348,7 @@ def _proposed(state: dict[str, Any]) -> "Result | None":
 
 
 def _print(result: "Result") -> None:
-    """A table in a pipe; on a terminal a line for each value, with its meaning below."""
+    """Print a table in a pipe; on a terminal one line per value, with its meaning below."""
     if on_terminal(sys.stdout):
         for e in result.estimates:
             grade = f", {e.grade}" if e.grade else ""
@@ -350,7 +359,7 @@ def _print(result: "Result") -> None:
     else:
         _print_table(result)
     for missing in result.unobserved:
-        remark(f"not seen: {missing}")
+        remark(f"not covered: {missing}")
 
 
 def _print_table(result: "Result") -> None:
@@ -372,7 +381,7 @@ def _print_table(result: "Result") -> None:
 
 
 def _number(estimate: "Estimate") -> str:
-    """The value with half its interval, to two digits of that."""
+    """Format the value with half its interval, rounded to two digits of the interval."""
     value, low, high = estimate.value, estimate.low, estimate.high
     if isinstance(value, bool) or low is None or high is None:
         return f"{value:.5g}" if isinstance(value, float) else str(value).lower()

@@ -28,7 +28,7 @@ class PageCalibrator:
         self._clock = clock
 
     async def offered(self, truck: "TruckClient") -> list[dict[str, Any]]:
-        """Return the steps that fit the robot, in their order; those that were never done are due."""
+        """Return the steps that apply to the robot, in their order; steps never done are due."""
         from monstertruckd.tools.calibrate.wizard import missing
 
         config, known = await robot_config(truck), await _known(truck)
@@ -50,13 +50,13 @@ class PageCalibrator:
         """Run a step.
 
         Raises:
-            TruckError: there is no such step, an option is wrong, or it ended without a result.
+            TruckError: the step or an option is unknown, or it ended without a result.
         """
         from monstertruckd.tools.calibrate.wizard import measure, save
 
         run = next((run for run in sequence() if _id(run) == step), None)
         if run is None:
-            raise InputError(f"{step}: no such calibration")
+            raise InputError(f"{step}: unknown calibration")
         given = {name: _checked(run, name, value) for name, value in options.items()}
         config, known = await robot_config(truck), await _known(truck)
         result = await measure(wizard_of(run, given), truck, panel, self._clock, config, known)
@@ -68,7 +68,7 @@ class PageCalibrator:
 
 
 def _option(option: WizardOption, run: WizardRun) -> dict[str, Any]:
-    """An option as the page shows it, with the default of this step."""
+    """Describe an option for the page, with the default of this step."""
     default = run.step.options.get(option.name, option.default)
     return {
         "name": option.name,
@@ -82,10 +82,10 @@ def _option(option: WizardOption, run: WizardRun) -> dict[str, Any]:
 
 
 def _checked(run: WizardRun, name: str, value: float | bool | str) -> float | bool | str:
-    """The value of an option, of its type and within its bounds; of which choices it is one, the wizard says.
+    """Parse the value of an option and check its type and bounds; the wizard checks choices.
 
     Raises:
-        InputError: there is no such option, or the value does not fit.
+        InputError: the option is unknown, or the value is invalid.
     """
     option = next((option for option in run.wizard.options if option.name == name), None)
     if option is None:
@@ -111,7 +111,7 @@ def _id(run: WizardRun) -> str:
 
 
 def _sentence(doc: str) -> str:
-    """The first paragraph, in one line."""
+    """Return the first paragraph in one line."""
     return " ".join(doc.partition("\n\n")[0].split())
 
 
@@ -121,7 +121,7 @@ async def _known(truck: "TruckClient") -> "dict[str, Result]":
 
 
 def _rows(result: "Result", before: "Result | None") -> list[dict[str, Any]]:
-    """The estimates, each with its value of the run before."""
+    """Return the estimates, each with its previous value."""
     rows = []
     for estimate in result.estimates:
         old = None if before is None else before.estimate(estimate.name)

@@ -1,4 +1,4 @@
-"""The operator of a wizard at a terminal, or the answers of a script."""
+"""Operator interface of a wizard on a terminal, or answers of a script."""
 
 import asyncio
 import os
@@ -19,14 +19,14 @@ WORDS = {"y": True, "yes": True, "n": False, "no": False}
 
 
 class TerminalPanel:
-    """Questions on standard error, answers from the command line first, then from standard input, line by line.
+    """Asks on standard error; takes answers first from the command line, then from standard input, line by line.
 
     Args:
-        answers: ``NAME=VALUE``, for each name in the order of asking.
-        yes: everything asked to be done is done.
+        answers: ``NAME=VALUE`` pairs; repeated names in the order of the questions.
+        yes: whether to confirm every requested action.
 
     Raises:
-        InputError: an answer has another form.
+        InputError: an answer has another format.
     """
 
     def __init__(self, answers: list[str], *, yes: bool = False) -> None:
@@ -51,7 +51,7 @@ class TerminalPanel:
         if error is None:
             for name, values in self._given.items():
                 for value in values:
-                    remark(f"--answer {name}={value}: was not asked for")
+                    remark(f"--answer {name}={value}: the wizard did not ask for it")
 
     def say(self, text: str) -> None:
         """Show a sentence."""
@@ -59,7 +59,7 @@ class TerminalPanel:
         remark(text)
 
     def progress(self, name: str, done: float, total: float) -> None:
-        """Move the bar of this step."""
+        """Move the progress bar of this step."""
         if self._bar is None or self._bar[0] != name:
             self._close_bar()
             self._bar = (name, self._bars.enter_context(progress(name, total)))
@@ -69,13 +69,13 @@ class TerminalPanel:
         """Show nothing: plots are for the page."""
 
     async def number(self, step: Number) -> float:
-        """Ask until a number within the bounds comes; one given beforehand has to be right at once."""
+        """Ask until the answer is a number within the bounds; an answer given in advance must be valid."""
         while True:
             text, typed = await self._answer(step.name, step.question)
             try:
                 value = float(text.replace(",", "."))
             except ValueError:
-                wrong = f"{step.name}: {text!r} is no number"
+                wrong = f"{step.name}: {text!r} is not a number"
             else:
                 if step.low <= value <= step.high:
                     return value
@@ -85,7 +85,7 @@ class TerminalPanel:
             remark(wrong)
 
     async def confirm(self, step: Confirm) -> bool:
-        """Ask for yes or no; Enter is yes where something is only to be done."""
+        """Ask for yes or no; Enter means yes for an action."""
         if self._yes and not step.fact:
             return True
         while True:
@@ -94,13 +94,13 @@ class TerminalPanel:
                 return word
             if not text and not step.fact:
                 return True
-            wrong = f"{step.name}: {text!r} is neither yes nor no"
+            wrong = f"{step.name}: {text!r}: expected yes or no"
             if not typed:
                 raise InputError(wrong)
             remark(wrong)
 
     async def _answer(self, name: str, question: str) -> tuple[str, bool]:
-        """The answer, and whether it was typed."""
+        """Return the answer, and whether it was typed."""
         self._close_bar()
         if self._given[name]:
             value = self._given[name].popleft()
@@ -111,13 +111,13 @@ class TerminalPanel:
         return await self._line(name), True
 
     def _forget(self) -> None:
-        """Discard input typed before the question: an extra Enter would let the truck move."""
+        """Discard input typed before the question, because an extra Enter would let the truck move."""
         if os.isatty(source := sys.stdin.fileno()):
             termios.tcflush(source, termios.TCIFLUSH)
             self._rest = b""
 
     async def _line(self, name: str) -> str:
-        """A line of standard input. Nothing is read ahead of the question by a thread that Ctrl-C could not end."""
+        """Read a line of standard input, only when asked: a thread that reads ahead could not be ended by Ctrl-C."""
         loop, source = asyncio.get_running_loop(), sys.stdin.fileno()
         while b"\n" not in self._rest:
             readable = asyncio.Event()
@@ -131,7 +131,7 @@ class TerminalPanel:
                 loop.remove_reader(source)
             data = os.read(source, 1024)
             if not data:
-                raise InputError(f"{name}: no answer on standard input; give it by --answer {name}=VALUE")
+                raise InputError(f"{name}: no answer on standard input; pass --answer {name}=VALUE")
             self._rest += data
         line, _, self._rest = self._rest.partition(b"\n")
         return line.decode(errors="replace").strip()

@@ -1,4 +1,4 @@
-"""Commands on configuration files: check, show and upgrade them, and convert lenses from and for other programs."""
+"""Commands on configuration files: check, show, upgrade, and convert camera intrinsics."""
 
 import difflib
 import json
@@ -25,13 +25,13 @@ def show(
     config: ConfigArgument,
     keys: Annotated[
         list[str] | None,
-        typer.Option("--key", "-k", help="Only what is at or below this key, e.g. gate.leases; repeatable."),
+        typer.Option("--key", "-k", help="Only settings at or below this key, e.g. gate.leases; repeatable."),
     ] = None,
     json_output: JsonOption = False,
 ) -> None:
     """Check a configuration and print every value with its origin: file and line, calibration, or default.
 
-    Exit code 2 if it is refused, with one line for each mistake.
+    Exit code 2 if it is invalid, with one line for each error.
     """
     from monstertruck_runtime.errors import NotFoundError
     from monstertruckd.config.load import resolved
@@ -41,7 +41,7 @@ def show(
     values = resolved(loaded)
     leaves = [(key, value) for key, value in _leaves(values, ()) if _wanted(key, keys)]
     if not leaves:
-        raise NotFoundError(f"{config}: nothing at {', '.join(keys or ())}; sections: {', '.join(values)}")
+        raise NotFoundError(f"{config}: no settings at {', '.join(keys or ())}; sections: {', '.join(values)}")
     if json_output:
         origins = {_dotted(key): str(origin) for key, origin in tree.origins.items() if key and _wanted(key, keys)}
         print_json({"config": _kept(values, (), {key for key, _ in leaves}), "origins": origins})
@@ -65,7 +65,7 @@ def _leaves(value: Any, key: Key) -> list[tuple[Key, Any]]:
 
 
 def _kept(value: Any, key: Key, leaves: set[Key]) -> Any:
-    """``value`` with nothing but the given leaves in it."""
+    """Return ``value`` reduced to the given leaves."""
     if key in leaves or not isinstance(value, dict):
         return value
     inside = {name: (*key, name) for name in value}
@@ -83,12 +83,12 @@ def _short(value: Any) -> str:
 @app.command("migrate")
 def migrate(
     config: ConfigArgument,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show the changes, write nothing.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show the changes without writing them.")] = False,
     json_output: JsonOption = False,
 ) -> None:
-    """Bring a configuration of an older version, and all it includes, up to date.
+    """Upgrade a configuration of an older version, including all included files.
 
-    Comments stay, and so does the previous file, next to the new one as NAME.vN.
+    Comments are kept; the previous file is kept next to the new one as NAME.vN.
     """
     from monstertruckd.config.load import FILE_VERSION
     from monstertruckd.config.migrate import carry_out, plan
@@ -103,7 +103,7 @@ def migrate(
         if dry_run:
             print(_difference(upgrade), end="")
         else:
-            print(f"{upgrade.path}: version {upgrade.version} to {FILE_VERSION}; the previous one is {upgrade.kept}")
+            print(f"{upgrade.path}: version {upgrade.version} to {FILE_VERSION}; the previous file is {upgrade.kept}")
     if not upgrades:
         remark(f"{config}: up to date, version {FILE_VERSION}")
 
@@ -122,19 +122,20 @@ def convert_lens(
     file: Annotated[
         Path,
         typer.Argument(
-            help="Intrinsics of ROS, kalibr or OpenCV (YAML), or a robot's configuration.", show_default=False
+            help="Camera intrinsics of ROS, kalibr or OpenCV (YAML), or a robot's configuration.", show_default=False
         ),
     ],
     output: Annotated[Path | None, typer.Argument(help="File to write; default: standard output.")] = None,
-    form: Annotated[LensForm, typer.Option("--format", "-f", help="Form of the output.")] = LensForm.CONFIG,
+    form: Annotated[LensForm, typer.Option("--format", "-f", help="Output format.")] = LensForm.CONFIG,
     camera: Annotated[
-        str | None, typer.Option(help="Name in a chain of cameras, e.g. cam0.", show_default=False)
+        str | None, typer.Option(help="Camera name in a chain of cameras, e.g. cam0.", show_default=False)
     ] = None,
     size: Annotated[
-        str | None, typer.Option(help="Pixels, e.g. 640x480, if the file states none.", show_default=False)
+        str | None,
+        typer.Option(help="Image size in pixels, e.g. 640x480, if the file does not state it.", show_default=False),
     ] = None,
 ) -> None:
-    """Write camera intrinsics in another form; `config` is the section `devices.camera.driver.lens`."""
+    """Convert camera intrinsics to another format; `config` is the section `devices.camera.driver.lens`."""
     from monstertruck_runtime.outside import text_of
     from monstertruck_runtime.small_files import replace_file
     from monstertruck_runtime.yaml_files import LARGEST_YAML
@@ -147,7 +148,7 @@ def convert_lens(
         device = load_robot(file)[0].devices.camera
         lens = None if device is None else getattr(device.driver, "lens", None)
         if not isinstance(lens, LensConfig):
-            raise InputError(f"{file}: has no camera whose lens it states")
+            raise InputError(f"{file}: has no camera with lens parameters")
     else:
         lens = lens_from(text, file, camera=camera, size=_pixels(size))
     written = lens_text(lens, form)

@@ -10,7 +10,7 @@ from monstertruck_runtime.errors import NotFoundError, TruckError
 from monstertruckd.tools.cli.output import remark
 
 SOON: Final = 0.7
-"""Usual time limit of a robot's answer; after it the command reports that it waits (s)."""
+"""Usual timeout for a robot's answer; after it the command reports that it is waiting (s)."""
 
 
 if TYPE_CHECKING:
@@ -29,17 +29,18 @@ def with_robot(
     *,
     named: bool = True,
 ) -> T:
-    """Connect, run ``main(client, clock)``, and return its result; report a link that takes long.
+    """Connect, run ``main(client, clock)``, and return its result; report a slow connection.
 
     Args:
         main: coroutine that uses the robot.
-        robot: its name.
-        endpoint: where it listens.
-        timeout: seconds to wait for the link and for answers.
-        named: print the robot's name and host first; False for commands that only read, or print it themselves.
+        robot: name of the robot.
+        endpoint: address of the robot.
+        timeout: timeout for the link and for answers, s.
+        named: whether to print the robot's name and host first; False for commands that only read or print it
+            themselves.
 
     Raises:
-        NotFoundError: no robot answers there.
+        NotFoundError: no robot answers at this address.
     """
     import asyncio
 
@@ -66,7 +67,7 @@ async def _say_waiting(robot: str, endpoint: str, clock: "Clock") -> None:
 
 
 async def robot_config(client: "TruckClient") -> "TruckConfig":
-    """The configuration that the robot runs on, without the section ``sim``: no tool may know the world's truth."""
+    """Return the robot's configuration without the section ``sim``: no tool may use the true state of the world."""
     from monstertruckd.config.truck import TruckConfig
 
     running = await client.call("config")
@@ -75,7 +76,10 @@ async def robot_config(client: "TruckClient") -> "TruckConfig":
 
 
 async def not_ready(client: "TruckClient") -> str:
-    """Faulty services of the robot with reasons, to follow a remark about missing data; empty if all work."""
+    """List the faulty services of the robot with reasons, as an addition to a message about missing data.
+
+    Empty if all are ready.
+    """
     from monstertruck_schemas.health import ServiceState
     from monstertruck_schemas.topics import HEALTH
 
@@ -88,7 +92,7 @@ async def not_ready(client: "TruckClient") -> str:
 
 
 EXAMPLES = {"explorer": "explore", "planner": "goals", "points": "points", "zones": "zones"}
-"""Bundled configurations that have a section."""
+"""Bundled configurations that have this section."""
 
 
 async def require_section(client: "TruckClient", section: str, lacks: str) -> Any:
@@ -96,15 +100,15 @@ async def require_section(client: "TruckClient", section: str, lacks: str) -> An
 
     Args:
         client: client of the robot.
-        section: its name.
-        lacks: what the robot does not do without it, such as "does not explore".
+        section: name of the section.
+        lacks: capability that the robot lacks without it, such as "does not explore".
 
     Raises:
-        NotFoundError: the configuration does not have it.
+        NotFoundError: the configuration does not contain it.
     """
     found = (await client.call("config")).get(section)
     if not found:
-        example = f", as the bundled `{EXAMPLES[section]}` has" if section in EXAMPLES else ""
-        text = f"{lacks}: expected a section `{section}` in its configuration{example}"
+        example = f", like the bundled `{EXAMPLES[section]}`" if section in EXAMPLES else ""
+        text = f"{lacks}: add a section `{section}` to its configuration{example}"
         raise NotFoundError(f"robot {client.robot!r} {text}")
     return found

@@ -1,4 +1,4 @@
-"""Everything without a robot: the demo, the emulated robot, and `try`, which serves its page as well."""
+"""Commands without a robot: the demo, the emulated robot, and `try`, which also serves its page."""
 
 import itertools
 import os
@@ -39,9 +39,7 @@ SIMULATED_CONFIG = shipped("configs/demo.yaml")
 def demo(
     fast: Annotated[
         bool,
-        typer.Option(
-            "--fast/--real-time", help="Virtual clock, as fast as it computes and reproducible; or real time, to watch."
-        ),
+        typer.Option("--fast/--real-time", help="Virtual clock (fast, reproducible) or real time, to watch."),
     ] = True,
     seed: Annotated[int | None, typer.Option(help="Seed of world and devices; default: the configuration's.")] = None,
     config: SimulatedOption = DEMO_CONFIG,
@@ -49,14 +47,15 @@ def demo(
         "runs/demo"
     ),
     film: Annotated[
-        Path | None, typer.Option(help="On the virtual clock with engine mujoco: moving picture of the lap, FILE.gif.")
+        Path | None,
+        typer.Option(help="On the virtual clock with engine mujoco: write an animation of the lap, FILE.gif."),
     ] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """The emulated truck maps an unknown room, finds a tag and drives home: real drivers, real bytes, real log.
+    """The emulated truck maps an unknown room, finds a tag and drives home, using the real drivers, protocols and log.
 
-    It ends in pictures of the map and the report of its log. `demo --config points` does so in a whole flat. A
-    configuration with a path has it driven: `demo --config lap` drives a lap.
+    At the end it writes pictures of the map and the report of its log. `demo --config points` explores a whole flat. A
+    configuration with a path is driven along it: `demo --config lap` drives a lap.
     """
     from monstertruck_runtime.clock import run_wall
     from monstertruck_schemas.reasons import Reason
@@ -74,8 +73,8 @@ def demo(
     explores = simulated.path is None and simulated.explorer is not None
     if simulated.path is None and not explores:
         raise ConfigError(
-            f"{config}: path: expected the path to drive, or an explorer, there is neither; "
-            f"`monstertruckd simulate --run --config {config}` starts this robot"
+            f"{config}: path: expected a path to drive, or an explorer; `monstertruckd simulate --run "
+            f"--config {config}` starts this robot without"
         )
     if film is not None and (not fast or simulated.sim.world.engine != "mujoco" or film.suffix.lower() != ".gif"):
         raise InputError(f"--film {film}: expected the virtual clock, engine mujoco, and a name.gif")
@@ -85,7 +84,10 @@ def demo(
     remark(f"starting the emulated robot and its daemon; log, map and outputs go to {folder}")
     screen = on_terminal(sys.stdout) and not json_output
     if not fast and (waiting := busy()):
-        remark(f"{waiting}: late control ticks may stop the robot; `monstertruckd demo --fast` waits for none")
+        remark(
+            f"{waiting}: late control ticks may stop the robot; `monstertruckd demo --fast` does not depend "
+            "on real time"
+        )
     summary: Summary | ExplorationSummary
     try:
         if explores:
@@ -113,7 +115,7 @@ def demo(
 
 @contextmanager
 def _progress(*, screen: bool) -> "Iterator[Report]":
-    """Show an exploration's map on a terminal, else lines."""
+    """Show the map of an exploration on a terminal, otherwise print lines."""
     from monstertruckd.tools.demo.picture import MapScreen
 
     if screen:
@@ -124,15 +126,18 @@ def _progress(*, screen: bool) -> "Iterator[Report]":
 
 
 def fresh(folder: Path) -> Path:
-    """``folder``, or the first of ``folder-2``, ``folder-3`` ... that is not there yet: no run overwrites another."""
+    """Return ``folder``, or the first of ``folder-2``, ``folder-3`` ...
+
+    That does not exist, so that no run overwrites another.
+    """
     names = itertools.chain([folder], (folder.with_name(f"{folder.name}-{n}") for n in itertools.count(2)))
     return next(name for name in names if not name.exists())
 
 
 def busy() -> str:
-    """How many programs want a processor for each one that there is, if that is more than one; empty otherwise."""
+    """Describe the load of this computer if it exceeds its number of processors; empty otherwise."""
     load, processors = os.getloadavg()[0], os.cpu_count() or 1
-    return f"this computer is busy, {load:.1f} programs for {processors} processors" if load > processors else ""
+    return f"this computer is busy: load {load:.1f} on {processors} processors" if load > processors else ""
 
 
 def _print(rows: list[tuple[str, str]], messages: dict[str, int]) -> None:
@@ -149,26 +154,30 @@ def simulate(
         str | None,
         typer.Option(
             metavar="A.yaml,B.yaml",
-            help="Several robots in one world, that of the first, instead of --config.",
+            help="Several robots in the world of the first, instead of --config.",
             show_default=False,
         ),
     ] = None,
-    truth: Annotated[Path | None, typer.Option("--truth", help="Write the simulated truth (npz) at the end.")] = None,
-    run: Annotated[bool, typer.Option("--run", help="Run the daemons of the same configurations, too.")] = False,
+    truth: Annotated[
+        Path | None, typer.Option("--truth", help="Write the simulated true poses (npz) at the end.")
+    ] = None,
+    run: Annotated[bool, typer.Option("--run", help="Also run the daemons of these configurations.")] = False,
     film: Annotated[
         Path | None,
-        typer.Option(help="Film a run on the virtual clock instead, FILE.gif; engine mujoco.", show_default=False),
+        typer.Option(help="Record a run on the virtual clock instead, FILE.gif; engine mujoco.", show_default=False),
     ] = None,
-    seconds: Annotated[float, typer.Option(min=1.0, max=3600.0, help="Length of the film, s of the run.")] = 30.0,
+    seconds: Annotated[
+        float, typer.Option(min=1.0, max=3600.0, help="Length of the recording, in seconds of the run.")
+    ] = 30.0,
 ) -> None:
-    """Serve simulated robots' devices behind ptys: at the ports their configurations name, else in a folder of yours.
+    """Serve the devices of simulated robots on ptys: at their configured ports, or in a folder of this user.
 
-    Faults are read from standard input as with `emulate`, each line beginning with the device's role, the monitor's
-    name, or `usb` (an unknown word lists the known ones); with several robots the robot's name stands before it.
-    `room post X Y` puts an obstacle into the world, `room clear` removes all.
-    `tape mark` and `tape` measure how far the robot really is from a mark, as who calibrates it is asked.
-    With `--film` nothing is served: robot and daemon run for some seconds on the virtual clock, the robot drives its
-    path or explores, and a moving picture of it is written.
+    Faults are read from standard input as with `emulate`; each line starts with the role of the device, the name of the
+    monitor, or `usb` (an unknown word lists the known ones). With several robots it starts with the robot's name. `room
+    post X Y` puts an obstacle into the world, `room clear` removes all. `tape mark` and `tape` answer the questions of
+    the calibration wizards: they measure the robot's true distance from a mark. With `--film` no device is served:
+    robot and daemon run on the virtual clock for some seconds, the robot drives its path or explores, and an animation
+    is written.
     """
     if film is not None:
         _film(config, film, seconds, alone=robots is None and truth is None and not run)
@@ -182,7 +191,7 @@ def simulate(
 
     names = [str(config)] if robots is None else robots.split(",")
     if "" in names:
-        raise InputError(f"--robots {robots}: expected names of files with one comma between each two")
+        raise InputError(f"--robots {robots}: expected file names separated by commas")
     files = [configuration(Path(name)) for name in names]
     simulated = as_fleet([load_simulated(file) for file in files])
     code = 0
@@ -197,10 +206,10 @@ def simulate(
 
 
 def _film(config: Path, film: Path, seconds: float, *, alone: bool) -> None:
-    """Film one robot.
+    """Record one robot.
 
     Raises:
-        InputError: of an option that does not go with it.
+        InputError: an option cannot be combined with it.
     """
     from monstertruckd.tools.demo.runs import run_film
     from monstertruckd.tools.simulation.config import load_simulated
@@ -223,17 +232,17 @@ def try_out(
         ),
     ] = Path("explore"),
     port: Annotated[
-        int, typer.Option("--port", "-p", min=1, max=65535, help="Port of the page; if it is taken, a free one.")
+        int, typer.Option("--port", "-p", min=1, max=65535, help="Port of the page; a free port if it is taken.")
     ] = 8470,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = True,
     output: Annotated[
         Path, typer.Option("--output", "-o", help="New folder for configuration, logs, state and map.")
     ] = Path("runs/try"),
 ) -> None:
-    """Emulated robot, mapping, planner and the operator's page at once: click where it shall drive.
+    """Start an emulated robot, mapping, planner and the operator's page; click on the map to drive.
 
-    The world has a room and a person who walks in it; the page adds obstacles and lets devices fail. A robot whose body
-    no route planner can steer is driven by hand.
+    The world contains a room and a walking person; the page adds obstacles and device faults. If no route planner
+    supports the robot's body, it is driven by hand.
     """
     with needs_extra("planning"), needs_extra("station"):
         from monstertruckd.tools.cli.calibrate_page import PageCalibrator

@@ -25,15 +25,14 @@ class DescriptionFormat(StrEnum):
 
 def description(
     config: ConfigArgument,
-    form: Annotated[DescriptionFormat, typer.Option("--format", "-f", help="Language of the file.")] = (
+    form: Annotated[DescriptionFormat, typer.Option("--format", "-f", help="Output format.")] = (
         DescriptionFormat.URDF
     ),
     output: Annotated[Path | None, typer.Option("--output", "-o", help="New file; default: standard output.")] = None,
 ) -> None:
     """Print the robot of a configuration as links, masses and joints, with the frames of its sensors.
 
-    The same description is what engine `mujoco` simulates. Masses and springs of an emulated robot come from its
-    section `sim`.
+    Engine `mujoco` simulates the same description. Masses and springs of an emulated robot come from its section `sim`.
     """
     from monstertruck_kinematics.description import urdf
     from monstertruckd.tools.simulation.config import load_robot
@@ -52,9 +51,10 @@ def description(
 
 
 def import_urdf(
-    file: Annotated[Path, typer.Argument(help="URDF of a robot with four wheels.", show_default=False)],
+    file: Annotated[Path, typer.Argument(help="URDF of a four-wheeled robot.", show_default=False)],
     links: Annotated[
-        list[str] | None, typer.Option("--link", help="Link of a device, e.g. lidar=base_scan.", show_default=False)
+        list[str] | None,
+        typer.Option("--link", help="URDF link of a device, e.g. lidar=base_scan.", show_default=False),
     ] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="New file; default: standard output.")] = None,
 ) -> None:
@@ -77,10 +77,10 @@ def import_urdf(
 
 
 def described(config: "TruckConfig") -> "Description":
-    """The robot with the frames of its sensors.
+    """Build the robot with the frames of its sensors.
 
     Raises:
-        InputError: its body has no description.
+        InputError: its body cannot be described.
     """
     from monstertruck_kinematics.description import SensorFrame
     from monstertruck_sim.world.mechanics import description as describe
@@ -94,7 +94,7 @@ def described(config: "TruckConfig") -> "Description":
 
 
 def model_text(config: "TruckConfig") -> str:
-    """The robot on level ground as MJCF."""
+    """Format the robot on level ground as MJCF."""
     from monstertruck_sim.world3d.engine import drive_line
     from monstertruck_sim.world3d.model import EMPTY, mjcf
 
@@ -103,13 +103,13 @@ def model_text(config: "TruckConfig") -> str:
 
 
 def _parts(config: "TruckConfig") -> "tuple[SimTruckConfig, Mechanics]":
-    """Body and dimensions as the daemon has them; masses and springs as simulated."""
+    """Body and dimensions as configured for the daemon; masses and springs as simulated."""
     from monstertruck_sim.world.config import SOLID_BODIES, WorldConfig
     from monstertruck_sim.world.mechanics import mechanics
     from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
     if config.body.kind not in SOLID_BODIES:
-        raise InputError(f"body {config.body.kind}: has no description; expected one of {', '.join(SOLID_BODIES)}")
+        raise InputError(f"body {config.body.kind}: cannot be described; expected one of {', '.join(SOLID_BODIES)}")
     world = config.sim.world if isinstance(config, SimulatedTruckConfig) else WorldConfig()
     geometry = config.geometry
     mass = world.truck.mass if isinstance(config, SimulatedTruckConfig) else geometry.mass

@@ -1,4 +1,4 @@
-"""Commands on single devices: emulate one on a pty, probe one on a port."""
+"""Commands on single devices: emulate a device on a pty, probe a device on a port."""
 
 import sys
 from collections.abc import Iterator
@@ -26,16 +26,17 @@ if TYPE_CHECKING:
 DeviceArgument = Annotated[
     str,
     typer.Argument(
-        help="Kind or role: lidar, drive, steering, compass, stabiliser, camera; probe: battery, link, host.",
+        help="Kind or role: lidar, drive, steering, compass, stabiliser, camera; for probe also battery, link, host.",
         autocompletion=complete_device,
     ),
 ]
 
 OWN_CLIENTS: Final = {
-    "video": "no video device: only this project's webcam driver, on `port: { path: ... }`, understands what it speaks",
-    "i2c": "no I2C bus: only this project's drivers and `probe` understand what it speaks",
+    "video": "this is not a video device: only this project's webcam driver, with `port: { path: ... }`, "
+    "understands its protocol",
+    "i2c": "this is not an I2C bus: only this project's drivers and `probe` understand its protocol",
 }
-"""Limits of an emulator's link, by the kind of port that its driver opens."""
+"""Limits of an emulator's link, by the kind of port used by its driver."""
 
 
 @needs_extra("sim")
@@ -43,14 +44,14 @@ def emulate(
     device: DeviceArgument,
     link: Annotated[
         Path | None,
-        typer.Option("--link", "-l", help="Symlink to create for the pty; default: where the emulated truck has it."),
+        typer.Option("--link", "-l", help="Symlink to create for the pty; default: the port of the emulated truck."),
     ] = None,
     tcp: Annotated[
-        str | None, typer.Option("--tcp", help="Serve at an address of this computer instead, e.g. 127.0.0.1:10940.")
+        str | None, typer.Option("--tcp", help="Serve on this TCP address instead, e.g. 127.0.0.1:10940.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the device's noise.")] = 0,
 ) -> None:
-    """Emulate one device, byte for byte, alone on a pty or a network socket: for third-party clients and bench work.
+    """Emulate one device, byte for byte, on a pty or a network socket: for third-party clients and bench tests.
 
     Faults are read from standard input, one per line: `unplug`, `plug`, `power-cycle`,
     `line stalled|deaf|delay|chunk|flip_rate|drop_rate|garbage VALUE`, `signal NAME FAULT [VALUE]` for a false
@@ -88,10 +89,10 @@ def probe(
         Path | None,
         typer.Option("--port", "-p", help="Device node, or ADDRESS:PORT on the network; for a camera also a pattern."),
     ] = None,
-    baud: Annotated[int | None, typer.Option(min=1, help="Bits per second; default: the device's own.")] = None,
+    baud: Annotated[int | None, typer.Option(min=1, help="Bits per second; default: the device's default.")] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Handshake with a device and print its identity, state and first samples. Moves nothing."""
+    """Connect to a device and print its identity, state and first samples, without moving anything."""
     from monstertruck_drivers.catalog import DEVICES
     from monstertruck_drivers.computer import ROOT, Computer
     from monstertruck_drivers.i2c.port import I2cPort
@@ -103,9 +104,9 @@ def probe(
 
     kind = DEVICES.named(device)
     if kind.opens in ("serial", "i2c") and port is None:
-        raise InputError(f"{device}: give its port with --port")
+        raise InputError(f"{device}: pass its port with --port")
     if kind.opens == "computer" and port is not None:
-        raise InputError(f"{device}: is the computer's own and hangs on no port; leave out --port")
+        raise InputError(f"{device}: is part of the computer and has no port; omit --port")
 
     async def main(clock: "Clock") -> dict[str, Any]:
         where: Any = Computer.at(ROOT, clock)
@@ -133,7 +134,7 @@ def probe(
 
 
 def _rows(value: Any, name: str) -> Iterator[tuple[str, str]]:
-    """Every single value of a report under its dotted name."""
+    """Flatten a report to single values with dotted names."""
     if isinstance(value, dict) and value:
         for key, inner in value.items():
             yield from _rows(inner, f"{name}.{key}" if name else str(key))

@@ -18,7 +18,10 @@ if TYPE_CHECKING:
     from monstertruck_runtime.clock import Clock
     from monstertruckd.tools.doctor.context import Finding
 
-CLEAR = "The robot is about to drive 20 cm ahead and back. Is half a metre free all around, and a person at the switch?"
+CLEAR = (
+    "The robot is about to drive 20 cm ahead and back. Is there half a metre of free space all around, and a "
+    "person at the switch?"
+)
 STYLES = {"ok": "green", "warn": "yellow", "fail": "bold red"}
 
 
@@ -33,14 +36,12 @@ def doctor(
             callback=bundled,
         ),
     ] = None,
-    root: Annotated[Path, typer.Option("--root", help="Check the system in this folder instead.")] = Path("/"),
-    fix: Annotated[
-        bool, typer.Option("--fix", help="Run the safe ones of the commands that fix something, each after asking.")
-    ] = False,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="With --fix and --drive: without asking.")] = False,
+    root: Annotated[Path, typer.Option("--root", help="Check the system below this folder instead.")] = Path("/"),
+    fix: Annotated[bool, typer.Option("--fix", help="Run the safe repair commands, asking before each.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="With --fix and --drive: do not ask.")] = False,
     drive: Annotated[
         bool,
-        typer.Option("--drive", help="Drive 20 cm there and back, after asking, to find sensors with a wrong sign."),
+        typer.Option("--drive", help="Drive 20 cm ahead and back, after asking, to find sensors with a wrong sign."),
     ] = False,
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
@@ -48,8 +49,8 @@ def doctor(
 ) -> None:
     """Check the computer: software, service, rights, cables, devices, clock, disk, network.
 
-    Every finding comes with the command that fixes it. Ends with the code of the first failure; warnings end with 0.
-    With --drive the daemon has to run: the drive goes through its gate, as any operator's does.
+    Every finding names the command that fixes it. The exit code is that of the first failure; warnings give 0. With
+    --drive the daemon must be running, because the drive goes through its gate.
     """
     from monstertruck_runtime.clock import run_wall
     from monstertruckd.tools.doctor import examine
@@ -77,7 +78,7 @@ def doctor(
 
 
 async def _drive(robot: str, endpoint: str, clock: "Clock", command: "Callable[..., str]") -> "list[Finding]":
-    """Findings of a drive through the daemon's gate."""
+    """Findings of a test drive through the daemon's gate."""
     from monstertruck_runtime.client import TruckClient
     from monstertruck_runtime.errors import TruckError
     from monstertruckd.tools.calibrate.motion import Mover
@@ -94,7 +95,7 @@ async def _drive(robot: str, endpoint: str, clock: "Clock", command: "Callable[.
 
 
 def _mend(findings: "Sequence[Finding]", *, yes: bool) -> None:
-    """Run the harmless remedies in turn."""
+    """Run the safe repair commands one by one."""
     import subprocess
 
     from monstertruckd.tools.doctor.context import Level, safe_fix

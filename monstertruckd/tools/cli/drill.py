@@ -21,23 +21,23 @@ FULL_CONFIG = shipped("configs/full.yaml")
 
 @needs_extra("sim")
 def drill(
-    seed: Annotated[int, typer.Option(min=0, help="Which faults, when, for how long.")] = 1,
-    count: Annotated[int, typer.Option(min=1, help="How many.")] = 50,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the faults, their times and durations.")] = 1,
+    count: Annotated[int, typer.Option(min=1, help="Number of faults.")] = 50,
     config: SimulatedOption = FULL_CONFIG,
     families: Annotated[
-        bool, typer.Option(help="Falsify any signal of any device and ignore commands, singly and in pairs.")
+        bool, typer.Option(help="Falsify any signal of any device and ignore commands, one at a time and in pairs.")
     ] = False,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Processes; default: all cores but one.")] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes; default: all cores but one.")] = None,
     resume: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Resume the drill whose outcomes are in this file; new ones are added."),
+        typer.Option(metavar="FILE", help="Resume the drill that wrote this file; new outcomes are appended."),
     ] = None,
     json_output: JsonOption = False,
 ) -> None:
     """Inject random faults into the emulated robot while it drives, and score its reactions.
 
     Everything runs on a virtual clock, with the deadman line wired. With --families an operator drives at random, and
-    the simulated world alone judges. Exit code 1 if any motion was unsafe or any service did not recover.
+    only the simulated world judges. Exit code 1 if any motion was unsafe or any service did not recover.
     """
     from monstertruckd.tools.drill.campaign import Campaign
     from monstertruckd.tools.drill.legs import default_jobs
@@ -108,7 +108,9 @@ def _show(report: "DrillReport", unguarded: Sequence[str], *, json_output: bool)
     _print(report)
     if unguarded:
         names = ", ".join(unguarded)
-        console().print(f"no fault cut off {names}: without a deadman line nothing stops a motor that is not reached")
+        console().print(
+            f"no fault disconnected {names}: without a deadman line, an unreachable motor cannot be stopped"
+        )
 
 
 def _print(report: "DrillReport") -> None:
@@ -123,10 +125,10 @@ def _print(report: "DrillReport") -> None:
         if outcome.stuck:
             out.print(f"{outcome.fault}: not recovered: {', '.join(outcome.stuck)}", style="yellow")
     out.print(
-        f"{len(report.outcomes)} faults: {report.unsafe} with unsafe motion, {report.stuck} with something stuck, "
-        f"{report.blocked} times moved by hand; "
-        f"recovered after {_seconds(report.recovery(50))} s (p50), {_seconds(report.recovery(99))} s (p99); "
-        f"score [bold]{report.score:.1f}[/bold] of 100"
+        f"{len(report.outcomes)} faults: {report.unsafe} with unsafe motion, {report.stuck} not "
+        f"recovered, {report.blocked} times moved by hand; recovered after "
+        f"{_seconds(report.recovery(50))} s (p50), {_seconds(report.recovery(99))} s (p99); score "
+        f"[bold]{report.score:.1f}[/bold] of 100"
     )
 
 

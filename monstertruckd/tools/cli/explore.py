@@ -1,4 +1,4 @@
-"""``monstertruckd explore``: have the robot explore unknown ground, and follow it."""
+"""``monstertruckd explore``: let the robot explore unknown ground, and follow its progress."""
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated
@@ -37,9 +37,9 @@ def explore(
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
     json_output: JsonOption = False,
 ) -> None:
-    """Explore: drive to the edges of the map until nothing is left to be seen, then home, and save the map.
+    """Explore: drive to the frontiers of the map until no unknown ground is left, then home, and save the map.
 
-    Prints its progress, and ends with it; its reason is the exit code. Ctrl-C stops it.
+    Prints the progress until the end; the exit code is the reason of the end. Ctrl-C stops it.
     """
     from monstertruck_schemas.req import ExploreOrder
     from monstertruckd.tools.cli.runs import run_exploration

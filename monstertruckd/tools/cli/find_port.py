@@ -1,4 +1,4 @@
-"""Finds the port of a cable by its being unplugged, and puts it into a configuration file."""
+"""Finds the port of a cable that the user unplugs, and writes it to a configuration file."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -25,13 +25,13 @@ POLL: Final = 0.2
 
 
 async def find_cable(role: str, machine: Machine, say: Callable[[str], None], timeout: float) -> UsbPortConfig:
-    """Ask for a cable to be unplugged and plugged in again, and name its place.
+    """Ask the user to unplug a cable and plug it in again; return its port.
 
     Args:
-        role: device at the cable, for the questions and the baud rate.
-        machine: where to look.
+        role: device at the cable, for the messages and the baud rate.
+        machine: computer whose ports are watched.
         say: shows one line to the user.
-        timeout: seconds to wait for either.
+        timeout: timeout for unplugging and for plugging in, s.
 
     Raises:
         NoAnswerError: no cable was unplugged in time.
@@ -49,7 +49,7 @@ async def find_cable(role: str, machine: Machine, say: Callable[[str], None], ti
             while await machine.offload(lambda: read_device(machine.sysfs, device.name)) is None:
                 await machine.clock.sleep(POLL)
     except TimeoutError:
-        say("still not plugged in there; the port counts all the same")
+        say("still not plugged in there; the port is used all the same")
     node = device.nodes[0]
     kinds = DEVICES.of_role(role)
     name = await machine.offload(lambda: topology_of(machine.sysfs, device.name))
@@ -63,7 +63,7 @@ async def find_cable(role: str, machine: Machine, say: Callable[[str], None], ti
 
 
 async def _unplugged(machine: Machine, say: Callable[[str], None]) -> UsbDevice:
-    """Wait until one device with a node vanishes alone."""
+    """Wait until exactly one device with a node disappears."""
 
     async def look() -> TreeSnapshot:
         return await machine.offload(lambda: read_tree(machine.sysfs))
@@ -75,23 +75,26 @@ async def _unplugged(machine: Machine, say: Callable[[str], None]) -> UsbDevice:
         if not _lost(before, now):
             before = now
             continue
-        # 0.4: seconds after the first loss until all of it is seen: a hub takes its devices along
+        # 0.4: seconds after the first loss until all losses are known: a hub takes its devices with it
         await machine.clock.sleep(0.4)
         now = await look()
         lost = _lost(before, now)
         if len(lost) == 1 and lost[0].nodes:
             return lost[0]
         if any(device.hub for device in lost):
-            say("a whole hub vanished: plug it in again and pull the device's own cable")
+            say("a whole hub disappeared: plug it in again and unplug the device's own cable")
         elif len(lost) > 1:
-            say("several devices vanished: pull one cable only")
+            say("several devices disappeared: unplug one cable only")
         elif lost:
-            say(f"{lost[0].usb_id} {lost[0].title} at {place(lost[0].name)} is no serial port or camera: try another")
+            say(
+                f"{lost[0].usb_id} {lost[0].title} at {place(lost[0].name)} is not a serial port or camera: "
+                "try another cable"
+            )
         before = now
 
 
 def _lost(before: TreeSnapshot, now: TreeSnapshot) -> list[UsbDevice]:
-    """Ports that are gone, or were for a moment."""
+    """Ports that disappeared, even briefly."""
     return [
         device
         for name, device in before.devices.items()
@@ -100,7 +103,7 @@ def _lost(before: TreeSnapshot, now: TreeSnapshot) -> list[UsbDevice]:
 
 
 def config_line(port: UsbPortConfig) -> str:
-    """The line for ``devices.<role>`` in the configuration."""
+    """Format the line for ``devices.<role>`` in the configuration."""
     return f"port: {_flow(port)}"
 
 
@@ -116,10 +119,10 @@ def _flow(port: UsbPortConfig) -> str:
 
 
 def require_place(path: Path, role: str) -> YamlText:
-    """The file ``path``, which must say ``devices.<role>.port``.
+    """Check that the file ``path`` contains ``devices.<role>.port``.
 
     Raises:
-        InputError: it cannot be read, is not YAML, or does not say it.
+        InputError: it cannot be read, is not YAML, or does not contain the key.
     """
     try:
         text = YamlText.read(path)
@@ -127,15 +130,15 @@ def require_place(path: Path, role: str) -> YamlText:
         raise InputError(str(error)) from error
     if text.node("devices", role, "port") is None:
         raise InputError(
-            f"{path}: no devices.{role}.port to replace; write it by hand into the file that says devices.{role}"
+            f"{path}: no devices.{role}.port to replace; edit the file that defines devices.{role} by hand"
         )
     return text
 
 
 def write_port(path: Path, role: str, port: UsbPortConfig) -> None:
-    """Replace ``devices.<role>.port`` in a configuration file; everything else stays as it is, comments too.
+    """Replace ``devices.<role>.port`` in a configuration file; everything else, including comments, is kept.
 
-    A baud rate that stood there is kept. The file is replaced as a whole or not at all.
+    A configured baud rate is kept. The file is replaced atomically.
 
     Raises:
         InputError: see ``require_place``; or the file cannot be written.

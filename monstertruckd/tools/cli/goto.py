@@ -1,4 +1,7 @@
-"""``goto``, ``track``, ``path``, ``dock``, ``undock``: send the robot somewhere, and follow it; ``convert-path``."""
+"""``goto``, ``track``, ``path``, ``dock``, ``undock``: drive the robot somewhere and follow its progress.
+
+``convert-path``.
+"""
 
 from collections.abc import Iterator
 from functools import partial
@@ -33,16 +36,16 @@ if TYPE_CHECKING:
     from monstertruckd.tools.cli.runs import RunEnd
 
 ROUTE_TIMEOUT: Final = 6.0
-"""Seconds to wait for a first route."""
+"""Timeout for the first route (s)."""
 
-ArmOption = Annotated[bool, typer.Option("--arm", help="Arm the robot as well; it drives off at once.")]
+ArmOption = Annotated[bool, typer.Option("--arm", help="Also arm the robot; it starts to drive at once.")]
 
 
 PathArgument = Annotated[
     Path,
-    typer.Argument(help="Table (CSV) of a path or raceline, or waypoints of Nav2 (YAML).", show_default=False),
+    typer.Argument(help="Table (CSV) of a path or raceline, or Nav2 waypoints (YAML).", show_default=False),
 ]
-ClosedOption = Annotated[bool, typer.Option("--closed", help="The path is a lap: its end is its start.")]
+ClosedOption = Annotated[bool, typer.Option("--closed", help="The path is a closed lap.")]
 ColumnsOption = Annotated[
     str | None, typer.Option(help="Names of the table's columns, e.g. x,y,yaw,speed.", show_default=False)
 ]
@@ -58,9 +61,9 @@ def goto(
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
     json_output: JsonOption = False,
 ) -> None:
-    """Drive to a pose in the map: the robot plans, follows and gets itself out of trouble.
+    """Drive to a pose in the map: the robot plans a route, follows it and recovers from failures.
 
-    Ends when the goal is reached or given up, with the reason's exit code. Ctrl-C cancels the goal.
+    Ends when the robot reaches the goal or gives up; the exit code is the reason. Ctrl-C cancels the goal.
     """
     from monstertruck_runtime.drives import drive_to
     from monstertruckd.tools.cli.goto_session import on_the_terminal
@@ -82,17 +85,17 @@ def track(
     closed: ClosedOption = False,
     columns: ColumnsOption = None,
     repair: Annotated[
-        bool, typer.Option("--repair", help="Turn with changes of direction where the robot cannot follow the path.")
+        bool, typer.Option("--repair", help="Reverse in turns where the robot cannot follow the path forwards.")
     ] = False,
     arm: ArmOption = False,
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
     json_output: JsonOption = False,
 ) -> None:
-    """Send a path to the robot and follow how it is driven.
+    """Send a path to the robot and follow its progress.
 
-    The robot refuses a path that it cannot drive and names the place. Ends at its end or when it is lost, with the
-    reason's exit code. Ctrl-C stops the robot; armed later, it does not resume the path.
+    The robot refuses a path that it cannot drive and names the place. The command ends at the end of the path or when
+    the robot loses it; the exit code is the reason. Ctrl-C stops the robot; armed later, it does not resume the path.
     """
     from monstertruck_planners.track.paths import load_path
     from monstertruck_runtime.drives import follow
@@ -114,10 +117,10 @@ def track(
 
 
 async def _repaired(client: "TruckClient", path: "PathMessage") -> "PathMessage":
-    """Return a path that the robot can drive, and print what was changed.
+    """Return a path that the robot can drive, and print the changes.
 
     Raises:
-        InputError: a bend has no replacement that is free on the robot's map.
+        InputError: a bend has no collision-free replacement on the robot's map.
         NotFoundError: the robot has no tracker.
     """
     from monstertruck_planners.collision import DistanceField, Footprint
@@ -142,17 +145,18 @@ async def _repaired(client: "TruckClient", path: "PathMessage") -> "PathMessage"
 
 def path(
     name: Annotated[
-        str | None, typer.Argument(help="Name of the configured path; left out: print it.", show_default=False)
+        str | None, typer.Argument(help="Name of the configured path; omit it to print the path.", show_default=False)
     ] = None,
     arm: ArmOption = False,
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
     json_output: JsonOption = False,
 ) -> None:
-    """Start the path of the robot's configuration by its name, and follow how it is driven.
+    """Start a path of the robot's configuration by its name, and follow its progress.
 
-    A robot with real ports drives it by this command or the page's button only, never by `arm` alone. Ends at the
-    path's end, when it is lost, or when the robot is disarmed, with the reason's exit code. Ctrl-C stops the robot.
+    A robot with real ports starts it only by this command or the page's button, never by `arm` alone. The command ends
+    at the end of the path, when the robot loses it, or when it is disarmed; the exit code is the reason. Ctrl-C stops
+    the robot.
     """
     from monstertruck_runtime.drives import drive_configured
     from monstertruckd.tools.cli.goto_session import on_the_terminal
@@ -174,17 +178,17 @@ def path(
 def convert_path(
     file: PathArgument,
     output: Annotated[Path, typer.Argument(help="File to write.", show_default=False)],
-    form: Annotated[PathForm, typer.Option("--format", "-f", help="Form of the output.")] = PathForm.CSV,
+    form: Annotated[PathForm, typer.Option("--format", "-f", help="Output format.")] = PathForm.CSV,
     closed: ClosedOption = False,
     columns: ColumnsOption = None,
     speed: Annotated[
-        float | None, typer.Option(min=0.0, help="Speed of a raceline without speeds, m/s.", show_default=False)
+        float | None, typer.Option(min=0.0, help="Speed for a raceline without speeds, m/s.", show_default=False)
     ] = None,
     width: Annotated[
-        float | None, typer.Option(min=0.0, help="Track on each side of a centreline, m.", show_default=False)
+        float | None, typer.Option(min=0.0, help="Free width on each side of a centreline, m.", show_default=False)
     ] = None,
 ) -> None:
-    """Write a path in the form of another program: racelines of F1TENTH and TUM, centrelines, waypoints of Nav2."""
+    """Convert a path to another format: racelines of F1TENTH and TUM, centrelines, waypoints of Nav2."""
     from monstertruck_planners.track.paths import load_path
     from monstertruck_runtime.path_files import names_of, path_text
     from monstertruck_runtime.small_files import replace_file

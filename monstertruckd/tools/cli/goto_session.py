@@ -9,7 +9,7 @@ from monstertruckd.tools.cli.output import progress, remark, with_remedy
 
 
 class TerminalReport(DriveReport):
-    """Remarks, and a bar for each part of the drive, on standard error."""
+    """Shows remarks, and a progress bar for each part of the drive, on standard error."""
 
     def __init__(self, shown: ExitStack) -> None:
         self._shown = shown
@@ -17,7 +17,7 @@ class TerminalReport(DriveReport):
         self._show: Callable[[float], None] = lambda _: None
 
     def waiting(self, text: str, share: float) -> None:
-        """Say it once, with a bar."""
+        """Report the start of a part, with a bar."""
         if self._what != "the planner is starting":
             remark(f"waiting: {text}")
         self.under_way("the planner is starting", share)
@@ -31,12 +31,12 @@ class TerminalReport(DriveReport):
         self._show(share)
 
     def stands(self, gate: GateState, why: str) -> None:
-        """Say it."""
+        """Print a remark."""
         remark(f"waiting: {with_remedy(gate.worst, why)}")
 
 
 @contextmanager
 def on_the_terminal() -> Iterator[TerminalReport]:
-    """A report whose bars are gone at the end."""
+    """Create a report whose bars disappear at the end."""
     with ExitStack() as shown:
         yield TerminalReport(shown)

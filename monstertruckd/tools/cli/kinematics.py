@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from monstertruck_kinematics.truck import SteeringModeName
     from monstertruck_kinematics.wheels import Wheel
 
-app = command_group("Kinematics of the truck and of every wheeled-robot family.")
+app = command_group("Kinematics of the truck and of all wheeled-robot families.")
 
-Png = Annotated[Path | None, typer.Option("--png", help="Also draw a picture into this file.")]
+Png = Annotated[Path | None, typer.Option("--png", help="Also write a figure to this file.")]
 Family = Annotated[str, typer.Argument(help="Drive family; `kinematics show` lists them.")]
 Settings = Annotated[list[str] | None, typer.Option("--set", "-s", help="Parameter as name=value, repeatable.")]
 Wheelbase = Annotated[float, typer.Option(help="Wheelbase, m.")]
@@ -38,10 +38,10 @@ ls: least squares over radii and speeds; max: least worst error. A trajectory of
 
 @contextmanager
 def refusals() -> Iterator[None]:
-    """Turn the library's refusals into errors of the command line.
+    """Convert errors of the kinematics library to command-line errors.
 
     Raises:
-        InputError: for any KinematicsError of the block.
+        InputError: the block raised a KinematicsError.
     """
     from monstertruck_kinematics.elementary import KinematicsError
     from monstertruck_runtime.errors import InputError
@@ -63,7 +63,7 @@ def text(value: object) -> str:
 
 @contextmanager
 def figure(path: Path, across: str, up: str) -> Iterator[Any]:
-    """Axes of a picture that is written when the block ends.
+    """Axes of a figure that is written when the block ends.
 
     Raises:
         NotInstalledError: matplotlib is not installed.
@@ -83,11 +83,11 @@ def figure(path: Path, across: str, up: str) -> Iterator[Any]:
 
 @app.command("show")
 def show_command(
-    family: Annotated[str | None, typer.Argument(help="One family in detail.")] = None,
+    family: Annotated[str | None, typer.Argument(help="Show one family in detail.")] = None,
     settings: Settings = None,
     json_output: JsonOption = False,
 ) -> None:
-    """The drive families, or one of them: inputs, parameters, mobility."""
+    """Print the drive families, or one in detail: inputs, parameters, mobility."""
     from monstertruck_kinematics.families import FAMILIES, build_drive, parameters_of
     from monstertruck_kinematics.wheels import analyse
 
@@ -123,15 +123,15 @@ def show_command(
 @app.command("mobility", context_settings={"ignore_unknown_options": True})
 def mobility_command(
     family: Family = "truck",
-    command: Annotated[
-        list[float] | None, typer.Argument(help="The drive's inputs, for their steering angles.")
-    ] = None,
+    command: Annotated[list[float] | None, typer.Argument(help="Drive inputs that set the steering angles.")] = None,
     settings: Settings = None,
-    wheels: Annotated[Path | None, typer.Option("--wheels", "-w", help="YAML list of wheels instead.")] = None,
+    wheels: Annotated[
+        Path | None, typer.Option("--wheels", "-w", help="YAML list of wheels instead of a family.")
+    ] = None,
     png: Png = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Degrees of mobility, steerability and manoeuvrability, and the turning centre."""
+    """Print the degrees of mobility, steerability and manoeuvrability, and the turning centre."""
     from monstertruck_kinematics.families import build_drive
     from monstertruck_kinematics.wheels import analyse
 
@@ -167,7 +167,7 @@ def mobility_command(
 
 @app.command("radius-table")
 def radius_table_command(
-    limits: Annotated[list[float] | None, typer.Option("--limit", "-l", help="Largest angle, degrees.")] = None,
+    limits: Annotated[list[float] | None, typer.Option("--limit", "-l", help="Maximum angle, degrees.")] = None,
     wheelbase: Wheelbase = 0.32,
     track: Track = 0.26,
     png: Png = None,
@@ -195,14 +195,14 @@ def radius_table_command(
         print_json([dict(zip(names, row, strict=True)) for row in table])
     else:
         print_table(
-            ("mode", "limit deg", "radius m", "if every wheel keeps the limit, m"),
+            ("mode", "limit deg", "radius m", "if no wheel exceeds the limit, m"),
             [(mode, f"{limit:.1f}", f"{axle:.3f}", f"{every:.3f}") for mode, limit, axle, every in table],
-            right=("limit deg", "radius m", "if every wheel keeps the limit, m"),
+            right=("limit deg", "radius m", "if no wheel exceeds the limit, m"),
         )
     if png:
         angles = [5.0 + 0.25 * i for i in range(141)]
         steered: tuple[SteeringModeName, ...] = ("front", "counter")
-        with figure(png, "steering limit, deg", "least turning radius, m") as axes:
+        with figure(png, "steering limit, deg", "minimum turning radius, m") as axes:
             for mode in steered:
                 radii = [geometry.minimum_radius(mode, math.radians(a)) for a in angles]
                 axes.plot(angles, radii, label=f"{mode} steering")
@@ -215,15 +215,15 @@ def linkage_command(
     drag_link: Annotated[float, typer.Option(help="Drag link, m.")] = 0.060,
     arm: Annotated[float, typer.Option(help="Wheel arm, m.")] = 0.025,
     arm_angle: Annotated[float, typer.Option(help="Wheel arm's inward angle, degrees.")] = 15.0,
-    king_pins: Annotated[float, typer.Option(help="Between the king-pins, m.")] = 0.200,
+    king_pins: Annotated[float, typer.Option(help="Distance between the king-pins, m.")] = 0.200,
     arms: Annotated[str, typer.Option(help="forward or rearward.")] = "rearward",
     polynomials: Annotated[str, typer.Option(help="corrected, as_published or 2016.")] = "corrected",
     png: Png = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Wheel angles over the servo angle: a linkage compared with the truck's fitted front polynomials.
+    """Print wheel angles over the servo angle: a linkage compared with the truck's fitted front polynomials.
 
-    The truck's real lengths are published nowhere; the defaults are an example of the right size.
+    The real lengths of the truck are unpublished; the defaults are an example of the right size.
     """
     import numpy as np
 
@@ -341,10 +341,10 @@ def fit(
     half_track: Annotated[float, typer.Option(help="Half the left-right wheel distance, m.")] = 0.0525,
     window: Annotated[int, typer.Option(help="Samples over which motion is compared.")] = 10,
     bounded: Annotated[bool, typer.Option(help="Plausible parameters only.")] = True,
-    png: Annotated[Path | None, typer.Option("--png", help="Also draw a picture into this file.")] = None,
+    png: Annotated[Path | None, typer.Option("--png", help="Also write a figure to this file.")] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Identify a skid-steer robot: from a trajectory, or from the skid-steer paper's circles."""
+    """Identify a skid-steer robot from a trajectory, or from the circles of the skid-steer paper."""
     from monstertruck_kinematics.identification import MODEL_NAMES, skid_model
 
     with refusals():
@@ -370,7 +370,7 @@ def _fit_file(path: Path, models: "list[SkidModel]", window: int, *, json_output
         )
         return
     for f in fits:
-        typer.echo(f"{f.model.name}: rms {f.fit.rms:.3f} of the expected noise")
+        typer.echo(f"{f.model.name}: rms {f.fit.rms:.3f} times the expected noise")
         rows = [(n, f"{v:.5f}", f"{e:.5f}" if math.isfinite(e) else "open") for n, v, e in f.parameter_table()]
         print_table(("parameter", "value", "standard error"), rows, right=("value", "standard error"))
 
@@ -418,9 +418,12 @@ def _fit_paper(models: "list[SkidModel]", png: Path | None, *, json_output: bool
         print()
         print_table(heads, rows, right=heads[1:])
     print()
-    heads = ("worst error of fits of less, %", "all radii, no speeds", "2:1 and 3:1, both")
+    heads = ("maximum error when fitted to fewer data, %", "all radii, no speeds", "2:1 and 3:1, both")
     print_table(heads, [(name, f"{radii[name]:.1f}", f"{driven[name]:.1f}") for name in driven], right=heads[1:])
-    print(f"\nEqual ratios were measured up to {floor:.1f} % off one common speed per rate: no model explains that.")
+    print(
+        f"\nThe measurements at equal ratios differ by up to {floor:.1f} % from one common speed per rate: no "
+        "model explains this."
+    )
     if png:
         _draw_errors(png, {name: abs(e).max(axis=0) for name, e in errors.items()})
 

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 def status(
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
-    once: Annotated[bool, typer.Option("--once", help="Print the state once and end.")] = False,
+    once: Annotated[bool, typer.Option("--once", help="Print the state once and exit.")] = False,
     json_output: Annotated[bool, typer.Option("--json", help="Machine-readable output; implies --once.")] = False,
 ) -> None:
-    """Live screen of a running robot. Piped or with --once it prints the state once."""
+    """Show a live screen of a running robot. In a pipe or with --once, print the state once."""
     from monstertruckd.tools.status.watch import print_once, watch
 
     if once or json_output or not on_terminal(sys.stdout):
@@ -37,13 +37,18 @@ def echo(
     topic: TopicArgument,
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
-    count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="End after so many messages.")] = None,
+    count: Annotated[
+        int | None, typer.Option("--count", "-n", min=1, help="Exit after this number of messages.")
+    ] = None,
     timeout: Annotated[
-        float | None, typer.Option(min=0.0, help="Give up after so many seconds without a message; exit code 5.")
+        float | None, typer.Option(min=0.0, help="Give up after this number of seconds without a message; exit code 5.")
     ] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Print a topic's messages as they come, one JSON object per line; on a terminal long lists are cut short."""
+    """Print the messages of a topic as they arrive, one JSON object per line.
+
+    On a terminal long lists are truncated.
+    """
     import asyncio
 
     from monstertruck_runtime.client import TruckClient
@@ -68,7 +73,7 @@ def echo(
                         print_json(shortened(message.model_dump(mode="json")) if short else message, indent=None)
                         seen += 1
                 except TimeoutError:
-                    raise NoAnswerError(f"no message of {topic} within {timeout:g} s") from None
+                    raise NoAnswerError(f"no message of {topic} received within {timeout:g} s") from None
                 finally:
                     waiting.cancel()
 
@@ -80,17 +85,17 @@ async def _explain_silence(client: "TruckClient", clock: "Clock", topic: "Topic[
 
     await clock.sleep(2.0)  # seconds without a message before `echo` reports the awaited topic
     if not await client.alive():
-        remark(f"no robot {client.robot!r} seen at {client.endpoint}; waiting for {topic.name}")
+        remark(f"robot {client.robot!r} not found at {client.endpoint}; waiting for {topic.name}")
     elif topic.writer is Writer.STAND:
         remark(f"robot {client.robot!r} only records {topic.name}, if `stand:` is set, and never publishes it; waiting")
     else:
         why = await not_ready(client)
-        remark(f"robot {client.robot!r} is there but publishes no {topic.name} yet; waiting{why}")
+        remark(f"robot {client.robot!r} is running but does not publish {topic.name} yet; waiting{why}")
 
 
 def shortened(value: Any) -> Any:
-    """``value`` with long lists and texts cut, each saying how long it was."""
-    short = 16  # values of a list that a terminal shows; text it cuts at four times as many characters
+    """Return ``value`` with long lists and texts truncated, each with its original length."""
+    short = 16  # maximum number of list values on a terminal; texts are truncated at four times as many characters
     match value:
         case dict():
             return {name: shortened(inner) for name, inner in value.items()}

@@ -1,4 +1,4 @@
-"""Commands on logs: look inside, repair, export, play back."""
+"""Commands on logs: inspect, repair, export, play back."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from monstertruckd.recorder.reader import LogReader
     from monstertruckd.tools.logs.messages import Progress, Selection
 
-app = command_group("Look inside, repair and export logs (MCAP).")
+app = command_group("Inspect, repair and export logs (MCAP).")
 
 TopicsOption = Annotated[
     list[str] | None, typer.Option("--topic", "-t", help="Only these topics.", autocompletion=complete_topic)
 ]
-StartOption = Annotated[float, typer.Option("--start", min=0.0, help="Seconds after the log's begin.")]
-EndOption = Annotated[float | None, typer.Option("--end", min=0.0, help="Seconds after the log's begin.")]
+StartOption = Annotated[float, typer.Option("--start", min=0.0, help="Seconds after the start of the log.")]
+EndOption = Annotated[float | None, typer.Option("--end", min=0.0, help="Seconds after the start of the log.")]
 
 
 RECOVER: Final = "`monstertruckd log recover` repairs it"
@@ -53,7 +53,7 @@ LogArgument = Annotated[Path, typer.Argument(help="MCAP file, finished or not.",
 
 @app.command("list")
 def list_command(
-    folder: Annotated[Path, typer.Argument(help="Folder of logs, with all folders in it.")] = Path("logs"),
+    folder: Annotated[Path, typer.Argument(help="Folder of logs, including subfolders.")] = Path("logs"),
     json_output: JsonOption = False,
 ) -> None:
     """List the logs of a folder, latest last: date, robot, duration, size, finished or not."""
@@ -108,7 +108,7 @@ def _show_info(log: Path, summary: "dict[str, Any]") -> None:
     size = f"{summary['size'] / 1e6:.2f} MB"
     print(f"{log}  {size}, {summary['duration']:.1f} s, {summary['messages']} messages")
     if summary["damage"]:
-        repair = "it is being written" if in_use(log) else RECOVER
+        repair = "the recorder is writing it" if in_use(log) else RECOVER
         print(f"damaged: {summary['damage']}; {repair}")
     rows = [
         (
@@ -127,15 +127,17 @@ def _show_info(log: Path, summary: "dict[str, Any]") -> None:
 
 @app.command("fetch")
 def fetch_command(
-    name: Annotated[str | None, typer.Argument(help="Recording on the robot; without it they are listed.")] = None,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="File; by default as on the robot.")] = None,
+    name: Annotated[str | None, typer.Argument(help="Recording on the robot; omit it to list them.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="File to write; default: the name on the robot.")
+    ] = None,
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
     json_output: JsonOption = False,
 ) -> None:
     """Fetch a recording from a running robot; resumes an earlier download.
 
-    The robot gives 1 MB/s at most, and one recording at a time.
+    The robot sends at most 1 MB/s, and one recording at a time.
     """
     from monstertruckd.station.recordings import fetch_recording
 
@@ -143,7 +145,7 @@ def fetch_command(
         answer = with_robot(lambda client, _: client.call("recordings"), robot, endpoint, named=False)
         _show_recordings(answer["recordings"], json_output=json_output)
         if left_out := answer.get("left_out"):
-            remark(f"{left_out} older ones are not listed")
+            remark(f"{left_out} older logs are not listed")
         return
     to = output or Path(Path(name).name)
     with progress(f"fetching {name}", 1.0) as shown:
@@ -184,7 +186,7 @@ def recover_command(
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Default: the log's own name.")] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Repair an unfinished or damaged log: every whole chunk is kept; the original stays as LOG.damaged."""
+    """Repair an unfinished or damaged log: every intact chunk is kept; the original is renamed to LOG.damaged."""
     from monstertruckd.recorder.repair import recover
 
     done = recover(log, output or log)
@@ -216,9 +218,9 @@ def report_command(
 def export_command(
     log: LogArgument,
     output: Annotated[
-        Path, typer.Argument(help="Folder of the tables; new folder of the bag; new MCAP file.", show_default=False)
+        Path, typer.Argument(help="Folder of the tables, new folder of the bag, or new MCAP file.", show_default=False)
     ],
-    form: Annotated[ExportFormat, typer.Option("--format", "-f", help="What to write.")] = ExportFormat.CSV,
+    form: Annotated[ExportFormat, typer.Option("--format", "-f", help="Output format.")] = ExportFormat.CSV,
     topics: TopicsOption = None,
     start: StartOption = 0.0,
     end: EndOption = None,
@@ -248,11 +250,11 @@ def export_command(
 def animate_command(
     log: LogArgument,
     output: Annotated[Path, typer.Argument(help="GIF file.", show_default=False)],
-    speed: Annotated[float, typer.Option(min=0.1, max=1000.0, help="Seconds of the log in one of the picture.")] = 8.0,
+    speed: Annotated[float, typer.Option(min=0.1, max=1000.0, help="Seconds of the log per frame.")] = 8.0,
     width: Annotated[int, typer.Option(min=64, max=1920, help="Pixels.")] = 560,
     json_output: JsonOption = False,
 ) -> None:
-    """Write a drive as a moving picture: the robot from above, its path, and the echoes of its lidar or sonars."""
+    """Write a drive as an animation: the robot from above, its path, and the echoes of its lidar or sonars."""
     from monstertruckd.recorder.reader import open_log
 
     with needs_extra("logs"):
@@ -270,12 +272,14 @@ def animate_command(
 @app.command("view")
 def view_command(
     log: LogArgument,
-    save: Annotated[Path | None, typer.Option("--save", help="Write this rerun file (.rrd), show nothing.")] = None,
+    save: Annotated[
+        Path | None, typer.Option("--save", help="Write this rerun file (.rrd) instead of showing the log.")
+    ] = None,
     topics: TopicsOption = None,
     start: StartOption = 0.0,
     end: EndOption = None,
 ) -> None:
-    """Show a log in the rerun viewer, with a layout, without any network (extra `view`)."""
+    """Show a log in the rerun viewer, with a prepared layout and without network access (extra `view`)."""
     from monstertruckd.recorder.reader import open_log
     from monstertruckd.tools.logs.messages import Selection
 
@@ -295,22 +299,22 @@ def view_command(
 
 
 def finish_log(log: Path, fault: str | None) -> None:
-    """End a command that used a log: if that is damaged, with one sentence and its own exit code.
+    """End a command that used a log; if the log is damaged, print one sentence and use its exit code.
 
-    A log that is being written ends where it ends.
+    A log that is still being written is treated as complete up to its end.
 
     Raises:
-        Exit: it is damaged.
+        Exit: the log is damaged.
     """
     from monstertruckd.recorder.repair import in_use
 
     if fault is not None and not in_use(log):
-        finish(Reason.LOG_DAMAGED, f"{log}: {fault}; what is whole was used ({RECOVER})")
+        finish(Reason.LOG_DAMAGED, f"{log}: {fault}; only the intact part was used ({RECOVER})")
 
 
 @contextmanager
 def reading_log(what: str, log: Path) -> "Iterator[Progress]":
-    """Progress over the bytes of a log, and the door for whatever is in it."""
+    """Show progress over the bytes of a log, and convert errors of its content."""
     from monstertruck_runtime.outside import reading
 
     with progress(what, log.stat().st_size if log.is_file() else None) as done:

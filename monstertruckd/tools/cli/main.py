@@ -42,7 +42,7 @@ from monstertruckd.tools.cli.output import HELP_SETTINGS, HELP_STYLE, CommandGro
 app = Commands(
     name="monstertruckd",
     cls=CommandGroup,
-    help="One daemon that owns every device of a four-wheel-steer robot truck, drives it and records everything.",
+    help="A daemon that controls all devices of a four-wheel-steered robot truck, drives it and records its data.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=HELP_STYLE,

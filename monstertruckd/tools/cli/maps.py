@@ -44,7 +44,7 @@ LABELS = {
     "odometry_ahead_s": "odometry ahead, s",
     "poses": "poses by",
 }
-"""Names of facts that do not explain themselves."""
+"""Explanatory names of facts."""
 
 
 class FrontChoice(StrEnum):
@@ -75,18 +75,20 @@ Topics = Annotated[
     typer.Option("--topic", help="Topic of the scans, or of odometry, where a log has several; may be repeated."),
 ]
 StartAngle = Annotated[float | None, typer.Option(help="Angle of the first beam, degrees; for npz and CARMEN logs.")]
-AngleIncrement = Annotated[float | None, typer.Option(help="Angle between beams, degrees; the same.")]
-RangeMax = Annotated[float | None, typer.Option(min=0.1, help="Ranges from here on are no returns, m; the same.")]
+AngleIncrement = Annotated[float | None, typer.Option(help="Angle between beams, degrees; for the same logs.")]
+RangeMax = Annotated[
+    float | None, typer.Option(min=0.1, help="Ranges from here on mean no return, m; for the same logs.")
+]
 LidarMount = Annotated[
     tuple[float, float, float] | None,
-    typer.Option("--mount", help="Lidar in base: x, y (m), yaw (degrees); the same."),
+    typer.Option("--mount", help="Lidar in base: x, y (m), yaw (degrees); for the same logs."),
 ]
 Trajectory = Annotated[
     Path | None,
-    typer.Option(help="Write poses at the middle of each sweep; `build` lists lost ones again in NAME.lost.txt."),
+    typer.Option(help="Write the pose at the middle of each sweep; `build` also lists lost poses in NAME.lost.txt."),
 ]
 TrajectoryFormat = Annotated[PoseFormat, typer.Option(help="Format of the trajectory.")]
-Png = Annotated[Path | None, typer.Option("--png", help="Draw it.")]
+Png = Annotated[Path | None, typer.Option("--png", help="Draw the trajectory.")]
 
 
 @dataclass(frozen=True)
@@ -140,7 +142,7 @@ def build(
 ) -> None:
     """Build a map from a log's scans, and its odometry if it has any.
 
-    Exit code 90 (`pose_lost`) if more than a tenth of the path is lost; the map is written even so.
+    Exit code 90 (`pose_lost`) if the pose is lost on more than a tenth of the path; the map is written even so.
     """
     from monstertruck_estimation.slam.config import SlamConfig
     from monstertruck_estimation.slam.mount import mount_of
@@ -189,9 +191,11 @@ def build(
         _draw(png, _load(output))
     _print(facts, json_output)
     finish_log(log, scans.fault)
-    most_lost = 0.1  # share of the path that may be lost in a map built with success
+    most_lost = 0.1  # maximum share of the path with a lost pose
     if quality.lost_share > most_lost:
-        text = f"{quality.lost_share:.0%} of the path of {quality.length:.1f} m is lost (limit: {most_lost:.0%})"
+        text = (
+            f"the pose is lost on {quality.lost_share:.0%} of the {quality.length:.1f} m path (limit: {most_lost:.0%})"
+        )
         finish(Reason.POSE_LOST, f"{log}: {text}: check lidar geometry, stamps and odometry")
 
 
@@ -229,7 +233,7 @@ def show(
     }
     if g2o is not None:
         if saved.graph is None:
-            raise InputError(f"{place}: a grid without a pose graph: nothing to write to {g2o}")
+            raise InputError(f"{place}: an occupancy grid without a pose graph: no graph for {g2o}")
         replace_file(g2o, g2o_text(saved.graph))
         facts["g2o"] = g2o
     if png is not None:
@@ -262,7 +266,7 @@ def save(
             except TimeoutError:
                 text = f"{robot} published no map within {timeout:g} s"
                 if (await client.call("config")).get("slam") is None:
-                    text += ": its configuration has no section `slam`, as the bundled `slam` has"
+                    text += ": add a section `slam` to its configuration, like the bundled `slam`"
                 raise NoAnswerError(text + await not_ready(client)) from None
 
     grid = with_robot(newest, robot, endpoint, named=False)
@@ -278,9 +282,9 @@ def load_command(
     config: ConfigOption,
     output: Annotated[Path, typer.Option("--output", "-o", help="Configuration to write.")],
 ) -> None:
-    """Write a configuration that localises the robot in a saved map; replaces an earlier one.
+    """Write a configuration that localises the robot in a saved map; replaces one that this command wrote.
 
-    An explorer is left out: it makes maps.
+    It contains no explorer, because an explorer makes maps.
     """
     from monstertruck_runtime.errors import ConfigError, InputError
     from monstertruck_runtime.small_files import whole_file
@@ -297,7 +301,7 @@ def load_command(
     if robot.explorer is not None:
         values["explorer"] = None
     if os.path.lexists(output) and (output.samefile(config) or not _made_by_load(read_yaml(output))):
-        raise InputError(f"{output}: is there already, and this command did not write it; name another file")
+        raise InputError(f"{output}: exists and was not written by this command; choose another file")
     with whole_file(output) as part:
         part.write_text(yaml_text(values), encoding="utf-8")
         try:
@@ -328,7 +332,7 @@ def localise(
     *,
     options: ReadOptions,
 ) -> None:
-    """Localise a log's scans in a saved map, from an unknown start."""
+    """Localise the scans of a log in a saved map, starting from an unknown pose."""
     from monstertruck_estimation.slam.config import SlamConfig
     from monstertruck_estimation.slam.worker import SlamWorker
     from monstertruck_schemas.health import MATCHED
@@ -362,7 +366,7 @@ def _load(place: Path) -> "SavedMap":
 
 
 def _read(path: Path, options: ReadOptions) -> "ScanLog":
-    """Read a log; print a remark for assumed geometry."""
+    """Read a log; print a remark about assumed geometry."""
     import math
 
     with needs_extra("logs"):
@@ -374,18 +378,18 @@ def _read(path: Path, options: ReadOptions) -> "ScanLog":
         first, step = math.degrees(scan.start_angle), math.degrees(scan.angle_increment)
         x, y, yaw = scan.mount
         remark(
-            f"{path}: holds no {', '.join(log.assumed)}; taken: {len(scan.ranges)} beams from {first:g} degrees, "
-            f"{step:g} degrees apart, no return from {scan.range_max:g} m on, lidar at x {x:g}, y {y:g} m, "
-            f"yaw {math.degrees(yaw):g} degrees"
+            f"{path}: contains no {', '.join(log.assumed)}; assuming {len(scan.ranges)} beams from "
+            f"{first:g} degrees, {step:g} degrees apart, no return from {scan.range_max:g} m on, lidar at "
+            f"x {x:g}, y {y:g} m, yaw {math.degrees(yaw):g} degrees"
         )
     return log
 
 
 def _run(worker: Any, log: "ScanLog", config: Any) -> tuple[dict[str, Any], list["SlamEstimate"]]:
-    """Run every scan through the worker; returns facts to print, and the estimates.
+    """Process every scan by the worker; return facts to print, and the estimates.
 
     Raises:
-        InputError: no scan could be used.
+        InputError: no scan was usable.
     """
     from monstertruck_estimation.slam.worker_io import Start, WorkerInput
     from monstertruck_runtime.errors import InputError
@@ -408,7 +412,7 @@ def _run(worker: Any, log: "ScanLog", config: Any) -> tuple[dict[str, Any], list
                 estimates.append(outputs.estimate)
             advance(number)
     if not estimates:
-        raise InputError(f"{log.make} log: none of its {len(log.scans)} scans can be used; the last one: {refused}")
+        raise InputError(f"{log.make} log: none of its {len(log.scans)} scans is usable; the last one: {refused}")
     statuses = Counter(estimate.status.value for estimate in estimates)
     offsets = [estimate.offset for estimate in estimates if estimate.offset is not None]
     facts: dict[str, Any] = {
@@ -434,7 +438,7 @@ def _print(facts: dict[str, Any], json_output: bool) -> None:
 
 
 def _text(value: Any) -> str:
-    """A fact as people write it."""
+    """Format a fact for display."""
     if isinstance(value, float):
         return f"{value:.2f}"
     if isinstance(value, dict):
@@ -445,7 +449,7 @@ def _text(value: Any) -> str:
 
 
 def _draw(path: Path, saved: Any, places: Any = ()) -> None:
-    """The grid with the poses of its keyframes, or with another path."""
+    """Draw the grid with the poses of its keyframes, or with another path."""
     import numpy as np
 
     from monstertruckd.tools.cli.kinematics import figure

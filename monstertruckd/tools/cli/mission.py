@@ -24,30 +24,28 @@ app = command_group("Missions: sequences of steps for the robot.")
 
 WITHOUT = "does no missions"
 MISSIONS = shipped("configs/missions")
-FileArgument = Annotated[Path, typer.Argument(help="Mission or waypoints of Nav2 (YAML).", show_default=False)]
+FileArgument = Annotated[Path, typer.Argument(help="Mission or Nav2 waypoints (YAML).", show_default=False)]
 
 
 @app.command("run")
 def run_command(
-    file: Annotated[
-        Path | None, typer.Argument(help="Mission or waypoints of Nav2 (YAML).", show_default=False)
-    ] = None,
+    file: Annotated[Path | None, typer.Argument(help="Mission or Nav2 waypoints (YAML).", show_default=False)] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Resume the mission that a restart interrupted.")] = False,
     moved: Annotated[
-        bool, typer.Option("--moved", help="Resume although the robot is not where it was: its pose is right.")
+        bool, typer.Option("--moved", help="Resume even though the robot was moved; its pose is known to be right.")
     ] = False,
-    arm: Annotated[bool, typer.Option("--arm", help="Arm the robot first; it drives off at once.")] = False,
+    arm: Annotated[bool, typer.Option("--arm", help="Arm the robot first; it starts to drive at once.")] = False,
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
     json_output: JsonOption = False,
 ) -> None:
-    """Check a mission, start it and follow it to its end, whose reason is the exit code. Ctrl-C stops it."""
+    """Check a mission, start it and follow it to its end; the exit code is the reason of the end. Ctrl-C stops it."""
     from monstertruckd.tools.cli.runs import run_mission
 
     if (file is None) is not resume:
-        raise InputError("expected a mission's file, or --resume")
+        raise InputError("pass a mission file or --resume")
     if moved and not resume:
-        raise InputError("--moved: expected with --resume only")
+        raise InputError("--moved is valid with --resume only")
     mission = None if file is None else load(file)
 
     async def main(client: "TruckClient", _: "Clock") -> "RunEnd":
@@ -63,7 +61,7 @@ def check_command(
     file: FileArgument,
     config: Annotated[
         Path | None,
-        typer.Option("--config", "-c", help="Also check what this robot has.", show_default=False),
+        typer.Option("--config", "-c", help="Also check that this robot supports every step.", show_default=False),
     ] = None,
     map_folder: Annotated[
         Path | None,
@@ -71,7 +69,7 @@ def check_command(
     ] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Check a mission's file: every mistake with its line, steps that are never reached. Prints its steps."""
+    """Check a mission file: report every error with its line, and unreachable steps. Print its steps."""
     from monstertruck_planners.missions.check import lacking, steps_of
 
     mission, line_of = read(file)
@@ -100,7 +98,7 @@ def list_command(
     folder: Annotated[Path, typer.Argument(help="Folder with missions.")] = MISSIONS,
     json_output: JsonOption = False,
 ) -> None:
-    """Print the missions of a folder, and the faults of those that cannot be run."""
+    """Print the missions in a folder, and the errors in invalid ones."""
     if not folder.is_dir():
         raise NotFoundError(f"{folder}: no such folder")
     rows = []
@@ -125,7 +123,7 @@ def list_command(
 
 @app.command("stop")
 def stop_command(robot: RobotOption = "truck", endpoint: EndpointOption = DEFAULT_ENDPOINT) -> None:
-    """End the mission that runs; the robot brakes and stands."""
+    """End the running mission; the robot brakes and stands."""
     from monstertruck_schemas.req import MissionOrder
 
     async def main(client: "TruckClient", _: "Clock") -> None:
@@ -141,7 +139,7 @@ def load(file: Path) -> "Mission":
 
 
 def read(file: Path) -> "tuple[Mission, Callable[[Key], str]]":
-    """Read a mission, or a file of waypoints as one that drives to each of them.
+    """Read a mission, or a file of waypoints as a mission that drives to each of them.
 
     Returns:
         The mission, and a function that returns file and line of a key.
@@ -169,7 +167,7 @@ def read(file: Path) -> "tuple[Mission, Callable[[Key], str]]":
 
 
 def require_none(mistakes: "list[Mistake]", line_of: "Callable[[Key], str]") -> None:
-    """Require a mission without mistakes.
+    """Require a mission without errors.
 
     Raises:
         ConfigError: one line per mistake, with file, line and step.
@@ -179,7 +177,7 @@ def require_none(mistakes: "list[Mistake]", line_of: "Callable[[Key], str]") -> 
 
 
 def abilities(config: Path | None, map_folder: Path | None) -> "Abilities":
-    """Return what the robot of a configuration has, and the points of a saved map.
+    """Return the capabilities of the configured robot, and the points of a saved map.
 
     Raises:
         ConfigError: the configuration is invalid.

@@ -48,7 +48,7 @@ def move(
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
     json_output: JsonOption = False,
 ) -> None:
-    """Drive an arc, straight on, sideways or round on the spot, by --length or by --angle.
+    """Drive an arc, straight, sideways or on the spot, given by --length or --angle.
 
     Options left out are settings of the configuration's behaviour `move`. Ends at the end of the move, or with the
     reason why it was refused or given up. Ctrl-C stops it.

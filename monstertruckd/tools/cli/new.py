@@ -1,4 +1,7 @@
-"""``new-robot``: a robot's configuration and its simulated twin, from answers; ``new-driver``: a driver's package."""
+"""``new-robot``: a robot's configuration and its simulated twin, from questions.
+
+``new-driver``: the package of a driver.
+"""
 
 import sys
 from collections.abc import Iterator
@@ -32,12 +35,14 @@ class AnswersCommand(ModelCommand):
 def new_robot(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="Name of the robot and of its folder.", show_default=False)],
-    folder: Annotated[Path, typer.Option("--folder", help="Where its folder is made.")] = Path(),
-    ask: Annotated[bool, typer.Option("--ask/--no-ask", help="Ask on a terminal for what no option says.")] = True,
+    folder: Annotated[Path, typer.Option("--folder", help="Parent folder of the new folder.")] = Path(),
+    ask: Annotated[
+        bool, typer.Option("--ask/--no-ask", help="Ask on the terminal for values that no option sets.")
+    ] = True,
 ) -> None:
     """Write a new robot's configuration and its simulated twin, and print the commands to enter next.
 
-    The new folder holds robot.yaml, simulation.yaml and twin.yaml. Existing files are never overwritten.
+    The new folder contains robot.yaml, simulation.yaml and twin.yaml. Existing files are never overwritten.
     """
     from monstertruck_drivers.computer import Sysfs
     from monstertruck_drivers.usb.tree import read_tree
@@ -55,7 +60,7 @@ def new_robot(
 
 
 def _asked(given: dict[str, Any]) -> dict[str, Any]:
-    """The answers, with those that a person gives to the questions that are left."""
+    """Complete the answers by asking the user the remaining questions."""
     from monstertruckd.tools.new_robot.answers import Answers, asked, mistake, question
 
     for name, field in Answers.model_fields.items():
@@ -75,14 +80,15 @@ def _asked(given: dict[str, Any]) -> dict[str, Any]:
 
 def new_driver(
     kind: Annotated[
-        DriverKind, typer.Argument(help="lidar: streams; sensor: answers; motors: drives shafts.", show_default=False)
+        DriverKind,
+        typer.Argument(help="lidar: streams scans; sensor: answers polls; motors: drives shafts.", show_default=False),
     ],
     name: Annotated[str, typer.Argument(help="Name of the device kind, such as acme_l5.", show_default=False)],
-    folder: Annotated[Path, typer.Option("--folder", help="Where its folder is made.")] = Path(),
+    folder: Annotated[Path, typer.Option("--folder", help="Parent folder of the new folder.")] = Path(),
 ) -> None:
-    """Write the package of a new driver: protocol, driver, emulator, identity, tests. Its tests pass as written.
+    """Write the package of a new driver: protocol, driver, emulator, identity and tests, which pass as written.
 
-    Replace the protocol by the device's own, then emulator and tests. Existing files are never overwritten.
+    Replace the protocol by that of the device, then adapt emulator and tests. Existing files are never overwritten.
     """
     made = write_driver(kind, name, folder)
     remark(f"written: {made}; next:")

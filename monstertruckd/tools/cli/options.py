@@ -1,4 +1,4 @@
-"""Options and arguments that many commands share, with their shell completion."""
+"""Options and arguments common to many commands, with their shell completion."""
 
 import inspect
 import math
@@ -16,18 +16,18 @@ from monstertruckd.tools.cli.places import only_robot
 from monstertruckd.tools.shipped import configuration, names
 
 ALWAYS: Final = "estop"
-"""Command that is never refused because several robots answer: it goes to the default port at once."""
+"""Command that is not refused when several robots answer: it uses the default port at once."""
 
 
 def complete_topic(incomplete: str) -> Iterator[tuple[str, str]]:
-    """Topics with their content."""
+    """Complete topics, with their content."""
     from monstertruck_schemas.topics import TOPICS
 
     return ((topic.name, topic.doc) for topic in TOPICS if topic.name.startswith(incomplete))
 
 
 def complete_device(incomplete: str) -> Iterator[tuple[str, str]]:
-    """Roles and kinds of devices."""
+    """Complete roles and kinds of devices."""
     from monstertruck_drivers.catalog import DEVICES
 
     words = [(role, DEVICES.named(role).name) for role in DEVICES.roles]
@@ -36,33 +36,33 @@ def complete_device(incomplete: str) -> Iterator[tuple[str, str]]:
 
 
 def complete_planner(incomplete: str) -> Iterator[tuple[str, str]]:
-    """Kinds of route planners."""
+    """Complete kinds of route planners."""
     from monstertruck_planners.route.catalog import ROUTE_PLANNERS
 
     return ((name, row.doc) for name, row in ROUTE_PLANNERS.items() if name.startswith(incomplete))
 
 
 def complete_role(incomplete: str) -> list[str]:
-    """Roles of devices in a configuration."""
+    """Complete roles of devices in a configuration."""
     from monstertruck_drivers.config import Devices
 
     return [role for role in Devices.model_fields if role.startswith(incomplete)]
 
 
 def complete_config(incomplete: str) -> list[str]:
-    """Bundled configurations, and files of the folder ``configs``; the shell completes other file names itself."""
+    """Complete bundled configurations, and files of the folder ``configs``; the shell completes other file names."""
     files = (*Path("configs").glob("*.yaml"), *Path("configs", "robots").glob("*.yaml"))
     return [word for word in (*names(), *sorted(map(str, files))) if word.startswith(incomplete)]
 
 
 def bundled(given: Path | None) -> Path | None:
-    """The file that an option or argument for a configuration means; see ``configuration``."""
+    """Resolve the file of a configuration option or argument; see ``configuration``."""
     return None if given is None else configuration(given)
 
 
 def _noted(context: typer.Context, option: typer.CallbackParam, value: str) -> str:
-    """Have the command that a refusal names reach the same robot."""
-    if value not in ("truck", DEFAULT_ENDPOINT):  # what ``arm`` and ``reset`` take without options
+    """Make the command suggested by a refusal address the same robot."""
+    if value not in ("truck", DEFAULT_ENDPOINT):  # options that ``arm`` and ``reset`` accept
         context.meta.setdefault(WHICH_ROBOT, {})[option.name] = f"{option.opts[0]} {value}"
     return value
 
@@ -89,8 +89,8 @@ EndpointOption = Annotated[
     typer.Option(
         "--endpoint",
         "-e",
-        help="Where the robot listens: tcp/HOST:PORT or tls/HOST:PORT. A daemon on this machine is reached by its Unix "
-        "socket, whose places are not those of stations.",
+        help="Address of the robot: tcp/HOST:PORT or tls/HOST:PORT. A daemon on this machine is reached by "
+        "its Unix socket and reserves places apart from those of stations.",
         callback=_nearest,
     ),
 ]
@@ -99,7 +99,7 @@ ConfigOption = Annotated[
     typer.Option(
         "--config",
         "-c",
-        help="Configuration of this robot or experiment: a file (YAML), or a bundled one by name, such as goals.",
+        help="Configuration of this robot or experiment: a file (YAML), or the name of a bundled one, such as goals.",
         show_default=False,
         autocompletion=complete_config,
         callback=bundled,
@@ -110,7 +110,7 @@ SimulatedOption = Annotated[
     typer.Option(
         "--config",
         "-c",
-        help="Configuration of a simulated robot: a file, or a bundled one by name, such as goals or mecanum.",
+        help="Configuration of a simulated robot: a file, or the name of a bundled one, such as goals or mecanum.",
         autocompletion=complete_config,
         callback=bundled,
     ),
@@ -118,7 +118,7 @@ SimulatedOption = Annotated[
 ConfigArgument = Annotated[
     Path,
     typer.Argument(
-        help="Configuration: a file (YAML), or a bundled one by name, such as demo.",
+        help="Configuration: a file (YAML), or the name of a bundled one, such as demo.",
         show_default=False,
         autocompletion=complete_config,
         callback=bundled,
@@ -133,28 +133,28 @@ TopicArgument = Annotated[
 
 
 UNITS: Final = {"deg": math.pi / 180, "°": math.pi / 180, "rad": 1.0}
-"""Units of an angle as people write them, in rad."""
+"""Factors from the units of an angle to rad."""
 
 
 def parse_angle(text: str) -> float:
-    """An angle in rad, from degrees (``90``, ``90deg``, ``90°``) or ``1.57rad``; nan and inf are let through.
+    """Parse an angle in degrees (``90``, ``90deg``, ``90°``) or radians (``1.57rad``), in rad; accepts nan and inf.
 
     Raises:
-        BadParameter: something else than a number with one of these units, or none.
+        BadParameter: it is not a number with one of these units, or without a unit.
     """
     unit = next((unit for unit in UNITS if text.endswith(unit)), "")
     try:
         return float(text.removesuffix(unit)) * UNITS[unit or "deg"]
     except ValueError:
-        raise typer.BadParameter("expected a number of degrees, or 1.57rad") from None
+        raise typer.BadParameter("expected degrees, or radians such as 1.57rad") from None
 
 
 def parse_heading(text: str) -> float:
-    """A heading in rad, written as an angle.
+    """Parse a heading, in rad.
 
     Raises:
-        BadParameter: no angle.
-        InputError: more than one turn, as of radians that were multiplied twice, or of metres.
+        BadParameter: it is not an angle.
+        InputError: it exceeds one turn, as radians converted twice would.
     """
     heading = parse_angle(text)
     if math.tau < abs(heading) < math.inf:
@@ -166,10 +166,10 @@ HEADING: Final = "Heading in the map, degrees, counter-clockwise from x; or 1.57
 
 
 def parse_pose(text: str, *, yaw_needed: bool = True) -> tuple[float, ...]:
-    """Numbers of a pose, m and rad; nan and inf are let through for the planner to refuse by name.
+    """Parse the numbers of a pose, m and rad; nan and inf are accepted, so that the planner refuses them by name.
 
     Raises:
-        InputError: something else than numbers with a heading, not enough of them, or more than one turn.
+        InputError: values that are not numbers, too few of them, or a heading above one turn.
     """
     expected = "x,y,yaw" if yaw_needed else "x,y or x,y,yaw"
     words = text.split(",")
@@ -183,10 +183,10 @@ def parse_pose(text: str, *, yaw_needed: bool = True) -> tuple[float, ...]:
 
 
 def require_finite(*poses: tuple[float, ...]) -> None:
-    """Refuse poses of a request before a robot is asked.
+    """Refuse invalid poses before contacting a robot.
 
     Raises:
-        InputError: one holds nan or an infinite number.
+        InputError: a pose contains nan or an infinite number.
     """
     for pose in poses:
         if not all(map(math.isfinite, pose)):
@@ -196,16 +196,16 @@ def require_finite(*poses: tuple[float, ...]) -> None:
 
 ViaOption = Annotated[
     list[str] | None,
-    typer.Option(metavar="X,Y[,YAW]", help="Place to pass on the way, m and degrees; may be repeated."),
+    typer.Option(metavar="X,Y[,YAW]", help="Pose or position to pass on the route, m and degrees; may be repeated."),
 ]
 
 
 def with_parameters(
     command: Callable[..., None], *functions: Callable[..., Any], without: Collection[str] = ()
 ) -> Callable[..., None]:
-    """Give ``command``, which takes any keywords, the parameters of ``functions`` as its options.
+    """Give ``command``, which accepts any keywords, the parameters of ``functions`` as its options.
 
-    Those that collect keywords and those named in ``without`` are left out. The help comes from the first function.
+    Excludes parameters that collect keywords, and those in ``without``. The help comes from the first function.
     """
     every = (parameter for function in functions for parameter in inspect.signature(function).parameters.values())
     parameters = [

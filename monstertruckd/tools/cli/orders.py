@@ -1,4 +1,4 @@
-"""``arm``, ``disarm``, ``estop``, ``reset``: one order each, whose outcome is the exit code; ``drive`` by hand."""
+"""``arm``, ``disarm``, ``estop``, ``reset``: one order each, with its outcome as exit code; ``drive`` by hand."""
 
 import math
 import sys
@@ -33,13 +33,13 @@ class OrderOutcome:
 
     order: "Order"
     reason: Reason
-    """OK, or why the gate refused."""
+    """OK, or the reason for the refusal."""
     text: str
     state: "GateState"
-    """The gate's state after it."""
+    """State of the gate after the order."""
 
     def as_json(self) -> dict[str, Any]:
-        """Everything as plain data."""
+        """Return all values as plain data."""
         return {
             "order": self.order,
             "accepted": self.reason is Reason.OK,
@@ -53,13 +53,14 @@ class OrderOutcome:
 
 
 async def give(client: "TruckClient", order: "Order", *, hold: bool = False) -> OrderOutcome:
-    """Give an order and wait for its outcome; ``hold`` as of ``TruckClient.order``.
+    """Send an order and wait for its outcome; ``hold`` as in ``TruckClient.order``.
 
-    An order to arm that is cancelled, or not answered, is followed by one to disarm: the robot may carry it out later.
+    If an order to arm is cancelled or not answered, an order to disarm follows, because the robot may carry out the
+    first one later.
 
     Raises:
         NoAnswerError: no answer in time.
-        NotFoundError: the robot is not there.
+        NotFoundError: no such robot.
     """
     import asyncio
 
@@ -72,7 +73,7 @@ async def give(client: "TruckClient", order: "Order", *, hold: bool = False) -> 
         if order is Order.ARM:
             with suppress(TruckError):
                 await client.order(Order.DISARM)
-                remark("disarmed: there was no answer to the order to arm")
+                remark("disarmed: the gate did not answer the order to arm")
         raise
     except RequestRefusedError as error:
         state = await client.get_retained(GATE)
@@ -90,11 +91,14 @@ async def _announce(client: "TruckClient", *, hold: bool) -> None:
         if row.expired:
             remark(f"calibration of {row.wizard} has expired ({row.expired}): monstertruckd calibrate {row.wizard}")
     if not hold and (names := await _set_off(client, await client.get_retained(GATE))):
-        print(f"will start at once: {', '.join(names)}; --hold arms without", file=sys.stderr)
+        print(f"will start to drive at once: {', '.join(names)}; --hold arms without starting", file=sys.stderr)
 
 
 async def _set_off(client: "TruckClient", gate: "GateState | None") -> list[str]:
-    """Who drives as soon as the robot is armed: those who ask for it now, and the tracker if it has a path."""
+    """Drivers that start as soon as the robot is armed.
+
+    Sources that request motion now, and the tracker if it has a path.
+    """
     import asyncio
 
     from monstertruck_runtime.mailbox import latest
@@ -103,7 +107,7 @@ async def _set_off(client: "TruckClient", gate: "GateState | None") -> list[str]
     names = [] if gate is None else list(gate.waiting)
     if gate is not None and not gate.mode.active and "tracker" not in names:
         with client.subscribe(TRACKER, latest()) as tracker, suppress(TimeoutError):
-            async with asyncio.timeout(0.3):  # seconds within which a tracker with a path sends its requests
+            async with asyncio.timeout(0.3):  # seconds within which a tracker with a path sends its first request
                 along = await tracker.next()
             path = f"path {along.path!r}" if along.path else "its path"
             names.append(f"tracker, along {path} of {along.length:.1f} m")
@@ -132,7 +136,7 @@ def _run(name: str, robot: str, endpoint: str, *, json_output: bool, hold: bool 
 
 
 def _name_others(robot: str, endpoint: str) -> None:
-    """Name the robots of this computer that an emergency stop did not go to."""
+    """Name the robots of this computer that did not receive an emergency stop."""
     if len(local_endpoints(near=endpoint)) > 1:
         for other in robots_here(endpoint):
             if other != (robot, endpoint):
@@ -154,10 +158,13 @@ def arm(
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
     json_output: JsonOption = False,
     hold: Annotated[
-        bool, typer.Option("--hold", help="Let no tracker drive, along a configured path too, until armed without.")
+        bool,
+        typer.Option(
+            "--hold", help="Hold all trackers, also on a configured path, until the robot is armed without this option."
+        ),
     ] = False,
 ) -> None:
-    """Allow the robot to move; prints before which planners will start, such as the tracker of a configured path."""
+    """Allow the robot to move; first prints which planners will start, such as the tracker of a configured path."""
     _run("arm", robot, endpoint, json_output=json_output, hold=hold)
 
 
@@ -171,7 +178,7 @@ def disarm(
 def estop(
     robot: RobotOption = "truck", endpoint: EndpointOption = DEFAULT_ENDPOINT, json_output: JsonOption = False
 ) -> None:
-    """Emergency stop: at once, latched over restarts of the daemon until `reset`."""
+    """Trigger the emergency stop, which is latched across restarts of the daemon until `reset`."""
     _run("estop", robot, endpoint, json_output=json_output)
 
 
@@ -186,27 +193,31 @@ def drive(
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
     mode: Annotated[SteeringMode, typer.Option(help="Which axles steer, or twist.")] = SteeringMode.FRONT,
-    speed: Annotated[float, typer.Option(min=SPEEDS[0], max=SPEEDS[-1], help="Speed to begin with, m/s.")] = SPEEDS[1],
-    angle: Annotated[float, typer.Option(min=1.0, max=45.0, help="Full lock of an axle, degrees.")] = 22.5,
+    speed: Annotated[float, typer.Option(min=SPEEDS[0], max=SPEEDS[-1], help="Initial speed, m/s.")] = SPEEDS[1],
+    angle: Annotated[float, typer.Option(min=1.0, max=45.0, help="Maximum steering angle of an axle, degrees.")] = 22.5,
     hold: Annotated[
         float,
-        typer.Option(min=0.1, max=1.0, help="Seconds a first press stands: just above the keyboard's repeat delay."),
+        typer.Option(
+            min=0.1, max=1.0, help="Duration of the first key press, s: slightly above the keyboard's repeat delay."
+        ),
     ] = 0.6,
     gamepad: Annotated[
-        bool, typer.Option("--gamepad", help="Drive by a gamepad as well, plugged in at any time.")
+        bool, typer.Option("--gamepad", help="Also drive by a gamepad, which may be plugged in at any time.")
     ] = False,
     mapping: Annotated[
         Path | None,
-        typer.Option("--mapping", help="YAML file with what its sticks and buttons do (docs/command-line.md)."),
+        typer.Option(
+            "--mapping", help="YAML file with the functions of its sticks and buttons (docs/command-line.md)."
+        ),
     ] = None,
 ) -> None:
-    """Drive with the keyboard: the robot moves only while a key is held, in this terminal.
+    """Drive with the keyboard: the robot moves only while a key is held in this terminal.
 
-    `Enter` arms, `W A S D` or the arrow keys drive, `space` is the emergency stop,
-    `r` resets it, `Esc` stops, `1` to `5` choose front, rear, counter, crab or hybrid steering, `z` and `c`
-    the drift of the last, `x` straightens the wheels, `+` and `-` change the speed, `q` ends.
-    `v`, held in place of `s`, drives in reverse into ground that no sensor has seen, at 0.05 m/s at most.
-    `6` drives by twist: `A` and `D` turn, also on the spot, `z` and `c` move left and right.
+    `Enter` arms, `W A S D` or the arrow keys drive, `space` is the emergency stop, `r` resets it, `Esc` stops, `1` to
+    `5` choose front, rear, counter, crab or hybrid steering, `z` and `c` the drift of hybrid steering, `x` straightens
+    the wheels, `+` and `-` change the speed, `q` ends. `v`, held instead of `s`, drives in reverse into ground that no
+    sensor has seen, at 0.05 m/s at most. `6` drives by twist: `A` and `D` turn, also on the spot, `z` and `c` move left
+    and right.
 
     With `--gamepad`: the robot moves only while the right shoulder button or trigger is held, into unseen ground
     while the left shoulder button is held as well; left stick, start arms, A stops, B is the emergency stop,
@@ -218,7 +229,7 @@ def drive(
     from monstertruckd.tools.driving.teleop import Teleop
 
     if not (on_terminal(sys.stdin) and on_terminal(sys.stdout)):
-        raise InputError("drive reads keys as they are held: it needs a terminal")
+        raise InputError("drive needs a terminal, to read held keys")
     level = min(range(len(SPEEDS)), key=lambda index: abs(SPEEDS[index] - speed))
     teleop = Teleop(math.radians(angle), first_hold=hold, level=level, mode=mode)
     pad = None if not gamepad and mapping is None else PadMapping() if mapping is None else read_mapping(mapping)

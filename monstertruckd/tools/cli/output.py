@@ -1,8 +1,8 @@
-"""What all commands share: ``--json``, plain text in pipes, progress on long work, exit codes by reason.
+"""Features common to all commands: ``--json``, plain text in pipes, progress bars, exit codes by reason.
 
-Results go to standard output, everything else (remarks, progress, errors) to standard error. Errors are raised as
-``TruckError``; ``CommandGroup`` prints them as one sentence and ends with their reason's exit code. Ctrl-C and SIGTERM
-mean the same: commands that run until they are stopped end with 0 (``until_stopped``), all others give up with
+Results are written to standard output, everything else (remarks, progress, errors) to standard error. Errors are raised
+as ``TruckError``; ``CommandGroup`` prints them as one sentence and exits with the exit code of their reason. Ctrl-C and
+SIGTERM are equivalent: commands that run until stopped exit with 0 (``until_stopped``), all others give up with
 ``CANCELLED``.
 """
 
@@ -34,36 +34,35 @@ if TYPE_CHECKING:
     from monstertruck_runtime.clock import WallClock
 
 PIPE_WIDTH: Final = 200
-"""Width of text that does not go to a terminal: wide enough to cut nothing."""
+"""Width of text that is not written to a terminal: wide enough to avoid truncation."""
 
 WIDE_CELL: Final = 48
-"""Longer cells fold on a terminal, and in a pipe reach beyond their column instead of widening it for all."""
+"""Longer cells fold on a terminal; in a pipe they exceed their column instead of widening it."""
 
 
 def on_terminal(stream: TextIO | None) -> bool:
-    """Whether a standard stream is a terminal, which is None if it was closed before the start."""
+    """Whether a standard stream is a terminal; the stream is None if it was closed before the start."""
     return stream is not None and stream.isatty()
 
 
 HELP_STYLE: Final = "markdown" if on_terminal(sys.stdout) and on_terminal(sys.stderr) else None
-"""Style of help and usage errors: framed on terminals, plain text (None) as soon as one of the two streams is a
-pipe."""
+"""Style of help and usage errors: framed on terminals, plain text (None) if either stream is a pipe."""
 
 HELP_SETTINGS: Final[dict[str, Any]] = {
     "max_content_width" if on_terminal(sys.stdout) else "terminal_width": PIPE_WIDTH,
     "help_option_names": ["-h", "--help"],
 }
-"""Settings of the command line: the terminal's own width, or unfolded lines; ``-h`` is ``--help`` everywhere."""
+"""Settings of the command line: the terminal's width, or unfolded lines; ``-h`` is ``--help`` everywhere."""
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable output.")]
 
 
 def print_json(value: Any, *, indent: int | None = 2) -> None:
-    """Print one JSON value; models and enums become plain, non-finite numbers become null.
+    """Print one JSON value; models and enums become plain values, non-finite numbers null.
 
     Args:
-        value: built of mappings, sequences, models, scalars.
-        indent: None for one line, in streams of values.
+        value: value of mappings, sequences, models and scalars.
+        indent: indentation; None: one line, for streams of values.
     """
     from monstertruck_runtime.plain import plain
 
@@ -71,7 +70,7 @@ def print_json(value: Any, *, indent: int | None = 2) -> None:
 
 
 def console(*, error: bool = False) -> "Console":
-    """Console for styled text: plain and uncut unless it is a terminal."""
+    """Console for styled text: plain and untruncated unless it is a terminal."""
     from rich.console import Console
 
     class PipedConsole(Console):
@@ -90,7 +89,7 @@ def print_table(
     right: Sequence[str] = (),
     title: str | None = None,
 ) -> None:
-    """Print rows under headings: on a terminal as a table that folds, in a pipe one unfolded line for each row.
+    """Print rows below headings: on a terminal as a folding table, in a pipe one unfolded line per row.
 
     If a terminal has no room for the last column, its cells are printed on separate lines, broken between words: a path
     is whole.
@@ -98,8 +97,8 @@ def print_table(
     Args:
         headings: one per column.
         rows: cells.
-        right: headings of the columns set to the right, the numbers.
-        title: a line above, on terminals only.
+        right: headings of the right-aligned columns (numbers).
+        title: title line, on terminals only.
     """
     if not on_terminal(sys.stdout):
         print("\n".join(_aligned(headings, rows, right)))
@@ -119,7 +118,7 @@ def print_table(
 
 
 def _has_room(lines: Sequence[Sequence[str]]) -> bool:
-    """Whether the last column of a table fits into a terminal, or folds into something that can be read."""
+    """Whether the last column of a table fits into a terminal, or folds into readable lines."""
     *others, last = zip(*lines, strict=True)
     room = shutil.get_terminal_size().columns - sum(max(map(len, column)) + 2 for column in others)
     longest_word = max((len(word) for cell in last for word in cell.split()), default=0)
@@ -152,20 +151,23 @@ def _aligned(headings: Sequence[str], rows: Sequence[Sequence[str]], right: Sequ
 
 
 def remark(text: str) -> None:
-    """Print a remark on standard error, so that standard output holds the result alone; a terminal breaks no word."""
-    if sys.stderr is not None:  # print() would take standard output in its place
+    """Print a remark on standard error, so that standard output contains only the result.
+
+    On a terminal words are not broken.
+    """
+    if sys.stderr is not None:  # print() would write to standard output
         if on_terminal(sys.stderr):
             text = wrapped(text)
         print(text, file=sys.stderr, flush=True)
 
 
 def print_words(text: str) -> None:
-    """Print words on standard output, at once; a terminal breaks none."""
+    """Print words on standard output immediately; on a terminal words are not broken."""
     print(wrapped(text) if on_terminal(sys.stdout) else text, flush=True)
 
 
 def wrapped(text: str, indent: str = "") -> str:
-    """Text broken between words at the width of the terminal; words without blanks, such as paths, stay whole."""
+    """Break text between words at the width of the terminal; words without blanks, such as paths, are kept."""
     wrapper = textwrap.TextWrapper(
         shutil.get_terminal_size().columns,
         initial_indent=indent,
@@ -177,20 +179,20 @@ def wrapped(text: str, indent: str = "") -> str:
 
 
 class Bar(Protocol):
-    """Shows how far something has come."""
+    """Progress display."""
 
     def __call__(self, done: float, what: str | None = None, /) -> None:
-        """Set how much is done, and ``what`` is being done if that has changed."""
+        """Set the amount done, and ``what`` if the activity has changed."""
         ...
 
 
 @contextmanager
 def progress(what: str, total: float | None = None) -> Iterator[Bar]:
-    """A bar on standard error, if that is a terminal; yields a function that sets how much of ``total`` is done.
+    """Show a bar on standard error if it is a terminal; yield a function that sets how much of ``total`` is done.
 
     Args:
-        what: is being done, in a few words.
-        total: amount; None = unknown.
+        what: activity, in a few words.
+        total: total amount; None: unknown.
     """
     if not on_terminal(sys.stderr):
         yield lambda _done, _what=None: None
@@ -209,14 +211,14 @@ REMEDIES: Final = {
 """Command that removes the cause of a refusal, and its effect."""
 
 WHICH_ROBOT: Final = "monstertruckd.which_robot"
-"""Key of a command's context: its options ``--robot`` and ``--endpoint`` as they were given."""
+"""Key of a command's context: its options ``--robot`` and ``--endpoint`` as given."""
 
 
 def finish(reason: Reason, text: str = "") -> None:
-    """End the command by ``reason``: with its exit code, and a sentence if that is not zero.
+    """Exit with the exit code of ``reason``, after a sentence if it is not zero.
 
     Raises:
-        Exit: the reason is no success.
+        Exit: the reason is not a success.
     """
     if reason.exit_code:
         remark(with_remedy(reason, text or reason.text))
@@ -224,7 +226,7 @@ def finish(reason: Reason, text: str = "") -> None:
 
 
 def with_remedy(reason: Reason, text: str) -> str:
-    """A refusal in words, and the command that removes its cause if there is one, for the same robot."""
+    """Describe a refusal and the command that removes its cause, if any, for the same robot."""
     from typer._click.globals import get_current_context
 
     if reason not in REMEDIES:
@@ -237,18 +239,18 @@ def with_remedy(reason: Reason, text: str) -> str:
 
 
 def print_end(reason: Reason, text: str, values: Mapping[str, Any], *, json_output: bool) -> None:
-    """Print how a drive or another run ended, and end the command by its reason.
+    """Print how a drive or another run ended, and exit with its reason.
 
-    Angles are shown in degrees as well. The robot's own text keeps to rad, as recorded runs are compared word by word.
+    Angles are also shown in degrees. The robot's text keeps rad, because recorded runs are compared word by word.
 
     Args:
         reason: reason of the end.
-        text: the end in words.
+        text: description of the end.
         values: data of the JSON output.
-        json_output: whether it is.
+        json_output: whether to print JSON.
 
     Raises:
-        Exit: the reason is no success.
+        Exit: the reason is not a success.
     """
     if json_output:
         print_json(values)
@@ -260,7 +262,7 @@ def print_end(reason: Reason, text: str, values: Mapping[str, Any], *, json_outp
 
 
 def until_stopped(main: "Callable[[WallClock], Coroutine[Any, Any, None]]") -> None:
-    """Run ``main(clock)`` until it returns, or until Ctrl-C or SIGTERM: its ordinary ends."""
+    """Run ``main(clock)`` until it returns, or until Ctrl-C or SIGTERM, which are normal ends."""
     from monstertruck_runtime.clock import run_wall
 
     with suppress(KeyboardInterrupt):
@@ -268,10 +270,10 @@ def until_stopped(main: "Callable[[WallClock], Coroutine[Any, Any, None]]") -> N
 
 
 class NumberCommand(TyperCommand):
-    """One command: refuses nan, which passes every comparison with a least or greatest value, before anything runs."""
+    """Command that refuses nan, which passes every comparison with a bound."""
 
     def make_context(self, *arguments: Any, **settings: Any) -> "Context":
-        """Read its options."""
+        """Parse its options."""
         context = super().make_context(*arguments, **settings)
         for parameter in self.params:
             value = context.params.get(parameter.name or "")
@@ -282,7 +284,7 @@ class NumberCommand(TyperCommand):
 
 
 class Commands(typer.Typer):
-    """Commands, each of which is a ``NumberCommand``."""
+    """Group of ``NumberCommand``."""
 
     def command(
         self, name: str | None = None, **settings: Any
@@ -292,22 +294,22 @@ class Commands(typer.Typer):
 
 
 def command_group(text: str) -> typer.Typer:
-    """An empty group of commands that ``text`` describes."""
+    """Create an empty group of commands with the description ``text``."""
     return Commands(help=text, no_args_is_help=True, rich_markup_mode=HELP_STYLE)
 
 
 class CommandGroup(TyperGroup):
-    """The root of the command line: turns expected errors, unusable files, interrupts and closed pipes into codes."""
+    """Root of the command line: converts expected errors, unusable files, interrupts and closed pipes to exit codes."""
 
     def make_context(self, *arguments: Any, **settings: Any) -> "Context":
-        """Read the options of the program itself."""
+        """Parse the options of the program itself."""
         with _usage_in_one_line():
             return super().make_context(*arguments, **settings)
 
     def invoke(self, ctx: "Context") -> Any:
         """Run the chosen command."""
         before = signal.getsignal(signal.SIGTERM)
-        if before is signal.SIG_DFL:  # `run` has its own
+        if before is signal.SIG_DFL:  # `run` handles them itself
             signal.signal(signal.SIGTERM, _interrupt)
         try:
             return self._invoke_and_flush(ctx)
@@ -318,17 +320,20 @@ class CommandGroup(TyperGroup):
         except ModuleNotFoundError as error:
             if error.name is None or error.name.startswith("monstertruck"):
                 raise
-            remark(f"{error.name} is not installed: an extra brings it (monstertruckd doctor names the command)")
+            remark(
+                f"{error.name} is not installed: install the extra that contains it (monstertruckd doctor "
+                "prints the command)"
+            )
             raise typer.Exit(Reason.NOT_INSTALLED.exit_code) from None
         except KeyboardInterrupt:
             remark(Reason.CANCELLED.text)
             raise typer.Exit(Reason.CANCELLED.exit_code) from None
-        except BrokenPipeError:  # e.g. `monstertruckd echo | head`: the reader has all it wants
+        except BrokenPipeError:  # for example `monstertruckd echo | head`: the reader needs no more
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit from None
         except OSError as error:
             full = disk_reason(error) is Reason.DISK_FULL
-            if full and error.filename is None:  # most likely standard output, which must not be tried again
+            if full and error.filename is None:  # probably standard output, which must not be used again
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             if not full and error.filename is None:
                 raise
@@ -351,12 +356,12 @@ class CommandGroup(TyperGroup):
 
 @contextmanager
 def _usage_in_one_line() -> Iterator[None]:
-    """Print the mistake of a command line in one line, and which help explains it."""
+    """Print a usage error in one line, with the command for help."""
     from typer._click.exceptions import MissingParameter, NoArgsIsHelpError, UsageError
 
     try:
         yield
-    except NoArgsIsHelpError:  # a group without a command: its help is the answer
+    except NoArgsIsHelpError:  # a group without a command: print its help
         raise
     except UsageError as error:
         complaint = in_own_words(" ".join(error.format_message().split()).removesuffix("."))
@@ -375,9 +380,9 @@ def in_own_words(complaint: str) -> str:
 
 
 def _interrupt(_: int, frame: FrameType | None) -> None:
-    """SIGTERM does what Ctrl-C does at that moment, even where a shell made a job in the background ignore that.
+    """Make SIGTERM equivalent to Ctrl-C, even if a shell made a background job ignore it.
 
-    A second one, such as timeout(1) sends to the whole group, does not disturb the end that the first one began.
+    A second signal, such as timeout(1) sends to the whole group, does not disturb the shutdown.
     """
     signal.signal(signal.SIGTERM, lambda *_: None)
     handler = signal.getsignal(signal.SIGINT)

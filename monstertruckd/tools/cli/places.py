@@ -1,4 +1,4 @@
-"""Robots that answer on this computer: which one a command means that names no endpoint."""
+"""Robots that answer on this computer: selects the robot of a command without an endpoint."""
 
 from monstertruck_runtime import robots
 from monstertruck_runtime.endpoints import public
@@ -10,5 +10,5 @@ def options_for(robot: str, endpoint: str) -> str:
 
 
 def only_robot(name: str | None) -> str:
-    """Endpoint of a command that names none; see ``robots.only_robot``."""
+    """Return the endpoint of a command without one; see ``robots.only_robot``."""
     return robots.only_robot(name, options_for)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class SteeringChoice(StrEnum):
-    """Steering of the axles."""
+    """Modes of steering."""
 
     FRONT = "2ws"
     COUNTER = "counter"
@@ -24,7 +24,7 @@ class SteeringChoice(StrEnum):
 
 
 class UnknownChoice(StrEnum):
-    """How unknown cells count."""
+    """Treatments of unknown cells."""
 
     BLOCKED = "blocked"
     DEAR = "dear"
@@ -46,20 +46,22 @@ def plan(
         str, typer.Option("--planner", "-p", help="Kind of route planner.", autocompletion=complete_planner)
     ] = "hybrid",
     steering: Annotated[
-        SteeringChoice, typer.Option(help="Front axle only, both axles opposite, or both in all modes.")
+        SteeringChoice, typer.Option(help="Use the front axle only, both axles opposite, or both in all modes.")
     ] = SteeringChoice.BOTH,
     via: ViaOption = None,
-    unknown: Annotated[UnknownChoice, typer.Option(help="How unknown cells count.")] = UnknownChoice.BLOCKED,
-    budget: Annotated[float, typer.Option(min=0.01, help="Processor time for the route and its improvement, s.")] = 1.0,
+    unknown: Annotated[UnknownChoice, typer.Option(help="How to treat unknown cells.")] = UnknownChoice.BLOCKED,
+    budget: Annotated[
+        float, typer.Option(min=0.01, help="Processor time for search and improvement of the route, s.")
+    ] = 1.0,
     reproducible: Annotated[
         bool, typer.Option("--reproducible", help="Limit the work instead of the time: equal inputs give equal routes.")
     ] = False,
-    picture: Annotated[Path | None, typer.Option("--png", help="Draw map and route into this file.")] = None,
+    picture: Annotated[Path | None, typer.Option("--png", help="Draw map and route to this file.")] = None,
     json_output: JsonOption = False,
 ) -> None:
     """Plan a route over a map and print or draw it.
 
-    The truck is the Monstertruck; poses are of its base. The exit code follows the reason if there is no route.
+    The truck is the Monstertruck; poses are poses of its base. Without a route, the exit code is the reason.
     """
     from monstertruck_planners.route.api import RouteMap, Vehicle, make_planner, warm_up
     from monstertruck_planners.route.catalog import ROUTE_PLANNERS
@@ -136,16 +138,16 @@ def _print_summary(result: "RouteResult") -> None:
     statistics = result.statistics
     first = f", first route after {statistics['first_s'] * 1e3:.1f} ms" if statistics.get("elapsed_s") else ""
     if result.path is None:
-        print(f"path over the grid of cost {result.cost:.2f} m, no drivable motion{first}")
+        print(f"grid path of cost {result.cost:.2f} m, no drivable motion{first}")
         return
     path = result.path
-    tightest = f", least radius {1 / path.greatest_curvature:.3f} m" if path.greatest_curvature else ""
+    tightest = f", minimum radius {1 / path.greatest_curvature:.3f} m" if path.greatest_curvature else ""
     driven = f"{path.length:.2f} m ({path.backward:.2f} m backward), {path.cusps} changes of direction"
     print(f"route of {driven}{tightest}{first}")
 
 
 def _draw(file: Path, world: "WorldMap", vehicle: "Vehicle", result: "RouteResult", name: str) -> None:
-    """Map, route and footprints.
+    """Draw map, route and footprints.
 
     Raises:
         NotInstalledError: matplotlib is not installed.

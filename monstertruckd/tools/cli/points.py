@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from monstertruck_runtime.drives import Arrival
     from monstertruck_schemas.points import PointOfInterest, PointOrder
 
-app = command_group("Points of interest in the map: tags that the camera found, places that were marked.")
+app = command_group("Points of interest in the map: tags found by the camera, and places marked by operators.")
 
 NameArgument = Annotated[str, typer.Argument(help="Name of the point, such as tag-7 or dock.", show_default=False)]
 MapOption = Annotated[
@@ -54,7 +54,7 @@ def list_command(
 
 @app.command("export")
 def export_command(
-    file: Annotated[Path, typer.Argument(help="Name.csv, .geojson or .yaml.", show_default=False)],
+    file: Annotated[Path, typer.Argument(help="File name ending with .csv, .geojson or .yaml.", show_default=False)],
     map_folder: MapOption = None,
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
@@ -78,7 +78,7 @@ def goto_command(
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
     json_output: JsonOption = False,
 ) -> None:
-    """Drive to a marked place, or before a tag. Ctrl-C cancels the goal."""
+    """Drive to a marked place, or in front of a tag. Ctrl-C cancels the goal."""
     from monstertruck_runtime.drives import drive_to
     from monstertruckd.tools.cli.goto_session import on_the_terminal
 
@@ -98,16 +98,18 @@ def goto_command(
 @app.command("mark", context_settings={"ignore_unknown_options": True})
 def mark_command(
     name: NameArgument,
-    x: Annotated[float | None, typer.Argument(help="Metres; without, where the robot is.", show_default=False)] = None,
+    x: Annotated[
+        float | None, typer.Argument(help="Position, metres; default: the robot's.", show_default=False)
+    ] = None,
     y: Annotated[float | None, typer.Argument(help="Metres.", show_default=False)] = None,
     yaw: Annotated[
         float | None,
-        typer.Argument(parser=parse_heading, help=f"{HEADING} Else the robot's.", show_default=False),
+        typer.Argument(parser=parse_heading, help=f"{HEADING} Default: the robot's.", show_default=False),
     ] = None,
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
 ) -> None:
-    """Mark a place by name: where the robot is, or x y in the map; one that is there is moved."""
+    """Mark a place by name, at the robot's pose or at x y in the map; moves an existing place."""
     from monstertruck_schemas.points import PointOrder
 
     if (x is None) is not (y is None):
@@ -123,7 +125,7 @@ def mark_command(
 def remove_command(
     name: NameArgument, robot: RobotOption = "truck", endpoint: EndpointOption = DEFAULT_ENDPOINT
 ) -> None:
-    """Have a point of interest forgotten."""
+    """Remove a point of interest."""
     from monstertruck_schemas.points import PointOrder
 
     _order(PointOrder.REMOVE, robot, endpoint, name)
@@ -153,7 +155,7 @@ async def _newest(client: "TruckClient", clock: "Clock") -> "list[PointOfInteres
     from monstertruck_schemas.topics import POINTS
 
     await require_section(client, "points", WITHOUT)
-    wait = 3.0  # seconds to wait for the robot's list
+    wait = 3.0  # timeout for the robot's list (s)
     with client.subscribe(POINTS, latest()) as box:
         try:
             async with clock.deadline(wait):
@@ -164,7 +166,7 @@ async def _newest(client: "TruckClient", clock: "Clock") -> "list[PointOfInteres
 
 
 def row_of(point: "PointOfInterest") -> tuple[str, ...]:
-    """Name and numbers for a table."""
+    """Return name and numbers for a table."""
     from monstertruck_schemas.base import position_deviation
 
     place = (f"{value:z.2f}" for value in (point.x, point.y, point.yaw))
@@ -182,7 +184,7 @@ def values_of(point: "PointOfInterest") -> dict[str, Any]:
 
 
 def text_of(points: Sequence["PointOfInterest"], ending: str) -> str:
-    """Points as a file of one of ``FORMATS``: GeoJSON has coordinates in the map's metres."""
+    """Format points as one of ``FORMATS``; GeoJSON has coordinates in the map's metres."""
     from monstertruck_runtime.yaml_files import yaml_text
 
     rows = [values_of(point) for point in points]

@@ -1,4 +1,4 @@
-"""`replay`: publish a log on Zenoh again, or compute it again and compare."""
+"""`replay`: publish a log on Zenoh again, or recompute its outputs and compare."""
 
 import math
 from contextlib import suppress
@@ -15,28 +15,28 @@ if TYPE_CHECKING:
     from monstertruckd.tools.replay_check.comparison import GreatestDifference, TopicComparison
     from monstertruckd.tools.replay_check.result import CheckedReplay
 
-CHECK = "Compute the log's outputs again from its sensors and compare them."
+CHECK = "Recompute the log's outputs from its sensor data and compare them."
 CONFIG = "With --check: compute with this configuration and show the differences."
-TOLERANCE = "With --check: greatest difference that agrees, in m, rad and so on; 0 = equal bit for bit."
+TOLERANCE = "With --check: maximum accepted difference, in m, rad and so on; 0: outputs must be identical."
 
-ROUNDED = "the last digits differ, as between processors whose maths routines round otherwise"
+ROUNDED = "only the last digits differ, as between processors with different maths routines"
 
 
 def replay(
     log: LogArgument,
-    robot: Annotated[str, typer.Option("--robot", "-r", help="Name to replay under.")] = "truck",
-    endpoint: Annotated[str, typer.Option("--endpoint", "-e", help="Where to listen.")] = DEFAULT_ENDPOINT,
-    speed: Annotated[float, typer.Option(min=0.01, max=1000, help="Multiple of real time.")] = 1.0,
+    robot: Annotated[str, typer.Option("--robot", "-r", help="Robot name to replay under.")] = "truck",
+    endpoint: Annotated[str, typer.Option("--endpoint", "-e", help="Address to listen on.")] = DEFAULT_ENDPOINT,
+    speed: Annotated[float, typer.Option(min=0.01, max=1000, help="Speed, as a multiple of real time.")] = 1.0,
     topics: TopicsOption = None,
     check: Annotated[bool, typer.Option("--check", help=CHECK)] = False,
     config: Annotated[Path | None, typer.Option("--config", "-c", help=CONFIG)] = None,
     tolerance: Annotated[float | None, typer.Option("--tolerance", min=0, help=TOLERANCE)] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Publish a log on Zenoh at its own times, for `status`, `echo` and any other subscriber; or check it.
+    """Publish a log on Zenoh in its original timing, for `status`, `echo` and other subscribers; or check it.
 
-    Ctrl-C or SIGTERM end it, as its last message does, with exit code 0. With --check nothing is published: the outputs
-    are computed again from the recorded sensors and compared with the recorded ones.
+    Ends after the last message, or by Ctrl-C or SIGTERM, with exit code 0. With --check no message is published: the
+    outputs are recomputed from the recorded sensor data and compared with the recorded outputs.
     """
     if check:
         _check(log, config, tolerance, json_output=json_output)
@@ -58,7 +58,7 @@ def _check(log: Path, config: Path | None, tolerance: float | None, *, json_outp
 
     run, until = run_of(log)
     if until is not None:
-        remark(f"{log}: is a black box; its run {run} is computed up to the end of the box")
+        remark(f"{log}: is a black box; run {run} is recomputed up to its last message")
     with progress("check", sum(part.stat().st_size for part in parts_of(run))) as done:
         result = check_log(log, config, tolerance, done)
     if json_output:
@@ -73,7 +73,7 @@ def _show(result: "CheckedReplay") -> None:
     parts = f" (a run of {len(result.parts)} parts)" if len(result.parts) > 1 else ""
     print(f"{result.log}{parts}  {result.duration:.1f} s with {whose}")
     print_table(
-        ("topic", "compared", "equal", "missing", "extra", "greatest difference"),
+        ("topic", "compared", "equal", "missing", "extra", "maximum difference"),
         [
             (
                 row.topic.name,
@@ -87,7 +87,7 @@ def _show(result: "CheckedReplay") -> None:
         ],
         right=("compared", "equal", "missing", "extra"),
     )
-    print(f"{result.equal} of {result.compared} outputs equal bit for bit")
+    print(f"{result.equal} of {result.compared} outputs identical")
     if result.first is not None:
         first = result.first
         fields = ", ".join(first.fields) or "header"
@@ -95,11 +95,11 @@ def _show(result: "CheckedReplay") -> None:
     if result.rounded:
         remark(f"{ROUNDED}: try --tolerance {result.sufficient:g}")
     for message in result.unreadable:
-        remark(f"{message.topic} number {message.sequence} at {message.at:.2f} s was left out: {message.error}")
+        remark(f"{message.topic} number {message.sequence} at {message.at:.2f} s was skipped: {message.error}")
     if result.left_out is not None:
-        remark(f"goals and tracker are left out: {result.left_out}")
+        remark(f"goals and tracker are not recomputed: {result.left_out}")
     for topic, count in result.lost.items():
-        remark(f"{count} messages of {topic} never reached the log")
+        remark(f"{count} messages of {topic} were lost before the log")
 
 
 def _greatest(row: "TopicComparison") -> str:

@@ -13,7 +13,7 @@ from monstertruckd.tools.cli.output import JsonOption, print_json, print_table, 
 if TYPE_CHECKING:
     from monstertruck_runtime.clock import Clock
 
-VerboseOption = Annotated[bool, typer.Option("--verbose", "-v", help="Log debug messages, too.")]
+VerboseOption = Annotated[bool, typer.Option("--verbose", "-v", help="Also log debug messages.")]
 
 
 @needs_extra("robot")
@@ -25,7 +25,7 @@ def run(config: ConfigOption, verbose: VerboseOption = False) -> None:
 
 
 def topics(json_output: JsonOption = False) -> None:
-    """Print the topic table: every key, its message, rate, writer and who keeps it."""
+    """Print the topic table: every key with its message, rate, writer and retention."""
     from monstertruck_schemas.topics import TOPICS
 
     if json_output:
@@ -67,7 +67,7 @@ def topics(json_output: JsonOption = False) -> None:
 def plugins(json_output: JsonOption = False) -> None:
     """List the kinds that a configuration can choose, and the topics, with the distribution each comes from.
 
-    Kinds of other distributions are loaded to test them; broken ones are listed with the error.
+    Loads kinds of other distributions to test them; broken ones are listed with the error.
     """
     from monstertruckd.assembly.catalogs import plugins
 
@@ -86,7 +86,7 @@ def plugins(json_output: JsonOption = False) -> None:
 
 
 def reasons(json_output: JsonOption = False) -> None:
-    """Print the reasons of events, refusals and ends, each with the exit code it gives a command."""
+    """Print the reasons of events, refusals and ends, each with its exit code."""
     from monstertruck_schemas.reasons import Reason
 
     if json_output:
@@ -97,7 +97,7 @@ def reasons(json_output: JsonOption = False) -> None:
 
 
 def plan_server(robot: RobotOption = "truck", endpoint: EndpointOption = DEFAULT_ENDPOINT) -> None:
-    """Plan and track for a robot whose configuration says `placement: remote`, until Ctrl-C.
+    """Plan and track for a robot with `placement: remote` in its configuration, until Ctrl-C.
 
     It dials the robot, and again whenever the robot restarts; all its data comes from the robot.
     """

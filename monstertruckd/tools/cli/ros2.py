@@ -38,23 +38,25 @@ class Distribution(StrEnum):
 def ros2(
     robot: Annotated[
         str | None,
-        typer.Option("--robot", "-r", metavar="NAME@ENDPOINT", help="The robot. Default: the robot of this computer."),
+        typer.Option(
+            "--robot", "-r", metavar="NAME@ENDPOINT", help="Name of the robot. Default: the robot of this computer."
+        ),
     ] = None,
     face: Annotated[
         Face,
         typer.Option(
             "--face",
-            help="zenoh: the wire of rmw_zenoh, without ROS 2 here; rclpy: any middleware, by the ROS 2 here.",
+            help="zenoh: the protocol of rmw_zenoh, needs no ROS 2 here; rclpy: any middleware, needs ROS 2 here.",
         ),
     ] = Face.ZENOH,
     domain: Annotated[
         int, typer.Option("--domain", envvar="ROS_DOMAIN_ID", min=0, max=232, help="Domain of the ROS 2 nodes.")
     ] = 0,
     namespace: Annotated[
-        str, typer.Option("--namespace", help="Before all relative topics, such as /truck1: for several robots.")
+        str, typer.Option("--namespace", help="Prefix of all relative topics, such as /truck1: for several robots.")
     ] = "/",
     prefix: Annotated[
-        str, typer.Option("--frame-prefix", help="Before all frames, such as truck1/: for several robots.")
+        str, typer.Option("--frame-prefix", help="Prefix of all frames, such as truck1/: for several robots.")
     ] = "",
     connect: Annotated[
         str | None,
@@ -65,19 +67,25 @@ def ros2(
         typer.Option(
             "--listen",
             metavar="ENDPOINT",
-            help="Without --connect: where ROS 2 nodes reach this program; of a port that is taken the next free one.",
+            help="Without --connect: the address for ROS 2 nodes; the next free port if it is taken.",
         ),
     ] = "tcp/127.0.0.1:7447",
     distribution: Annotated[
-        Distribution, typer.Option("--distro", help="Jazzy, Kilted and Lyrical are served at once; Humble alone.")
+        Distribution,
+        typer.Option(
+            "--distro", help="ROS 2 distribution. One program serves Jazzy, Kilted and Lyrical; Humble needs its own."
+        ),
     ] = Distribution.JAZZY,
-    map_to_odom: Annotated[bool, typer.Option(help="Publish map to odom; off where slam_toolbox or amcl does.")] = True,
+    map_to_odom: Annotated[
+        bool, typer.Option(help="Publish map to odom; switch off if slam_toolbox or amcl does.")
+    ] = True,
     odom_to_base: Annotated[
-        bool, typer.Option(help="Publish odom to base_link; off where robot_localization does.")
+        bool, typer.Option(help="Publish odom to base_link; switch off if robot_localization does.")
     ] = True,
     clock: Annotated[bool, typer.Option("--clock", help="Publish /clock, for nodes with use_sim_time.")] = False,
     drive: Annotated[
-        bool, typer.Option(help="Let ROS 2 nodes drive, arm and send goals; the emergency stop they always may.")
+        bool,
+        typer.Option(help="Let ROS 2 nodes drive, arm and send goals; they can always trigger the emergency stop."),
     ] = True,
 ) -> None:
     """Show the robot to ROS 2 as a node, and pass on what ROS 2 nodes ask of it.
@@ -107,7 +115,7 @@ def ros2(
         remark(f"ros2: robot {address.name} is node {namespace.rstrip('/')}/{address.name} of domain {domain}")
         remark(f"ros2: RViz: rviz2 -d {RVIZ}")
         if connect is None and face is Face.ZENOH:
-            remark(f"ros2: nodes reach it by ZENOH_CONFIG_OVERRIDE='connect/endpoints=[\"{own}\"]'")
+            remark(f"ros2: nodes connect with ZENOH_CONFIG_OVERRIDE='connect/endpoints=[\"{own}\"]'")
 
     async def serve(wall: "WallClock") -> None:
         settings = session_settings(connect, own)

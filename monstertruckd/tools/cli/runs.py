@@ -125,7 +125,7 @@ async def run_mission(
         stands = _why_it_stands(stand)
         trouble = "stands" if stands else state.text  # stale inputs come and go while it stands
         if trouble and trouble != said:
-            lines.append(f"it stands: {stands}" if stands else f"it waits: {state.text}")
+            lines.append(f"standing: {stands}" if stands else f"waiting: {state.text}")
         before, said = state, trouble
         for line in lines:
             report(f"{state.elapsed:6.0f} s  {line}")
@@ -146,7 +146,7 @@ async def run_mission(
 def _failed(before: MissionState, state: MissionState) -> list[str]:
     """A line on the attempt that has failed between two reports, if one has."""
     again = state.node == before.node and state.attempt > before.attempt
-    return [f"it failed: {state.failed}"] if again or state.failures > before.failures else []
+    return [f"failed: {state.failed}"] if again or state.failures > before.failures else []
 
 
 def _why_it_stands(stand: StandstillMonitor) -> str:
@@ -159,11 +159,11 @@ def progress_line(state: ExplorationState, stands: str = "") -> str:
     """Progress of an exploration in less than 80 characters, or why the truck ``stands`` or waits."""
     where = "" if state.target is None else f" to ({state.target.x:.1f}, {state.target.y:.1f})"
     if stands:
-        return f"{state.elapsed:5.0f} s  it stands: {stands}"
+        return f"{state.elapsed:5.0f} s  standing: {stands}"
     if state.text and state.running:
-        return f"{state.elapsed:5.0f} s  it waits: {state.text}"
+        return f"{state.elapsed:5.0f} s  waiting: {state.text}"
     if state.phase is ExplorationPhase.LOOKING and not state.known:
-        return f"{state.elapsed:5.0f} s  waits for the first look at the map"
+        return f"{state.elapsed:5.0f} s  waiting for the first analysis of the map"
     found = "" if state.find is None else f", {state.found}/{state.find} tags"
     known = f"{state.known:6.1f} m^2{'' if found else ' known'}, {state.frontiers:2d} frontiers{found}"
     return f"{state.elapsed:5.0f} s {state.travelled:6.1f} m  {known}  {state.phase}{where}"

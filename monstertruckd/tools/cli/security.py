@@ -13,27 +13,32 @@ from monstertruckd.tools.cli.output import JsonOption, command_group, finish, pr
 if TYPE_CHECKING:
     from monstertruckd.tools.security.folder import Folder
 
-app = command_group("Certificates: an authority, who may connect to the robot, and what each may do there.")
+app = command_group("Certificates: an authority, the stations that may connect to the robot, and their rights.")
 
 FolderOption = Annotated[
     Path, typer.Option("--folder", "-f", help="Folder of the authority; keep it off the robot.", show_default=False)
 ]
 HERE = Path("security")
-NameArgument = Annotated[str, typer.Argument(help="Name of the station: letters, digits and . _ - @, no . or @ first.")]
+NameArgument = Annotated[
+    str, typer.Argument(help="Name of the station: letters, digits and . _ - @, not starting with . or @.")
+]
 RESTART = (
-    "Takes effect once these files are on the robot and its daemon was restarted; restart it while the robot stands."
+    "Takes effect once these files are on the robot and its daemon has been restarted; restart it while "
+    "the robot stands."
 )
 
 
 @app.command("init")
 def init(
-    robot: Annotated[str | None, typer.Option("--robot", "-r", help="Name of the robot; truck at first.")] = None,
+    robot: Annotated[str | None, typer.Option("--robot", "-r", help="Name of the robot; default: truck.")] = None,
     address: Annotated[
         list[str] | None,
-        typer.Option("--address", "-a", help="Address or host name that stations dial, at first this computer's own."),
+        typer.Option(
+            "--address", "-a", help="Address or host name that stations connect to; default: this computer's."
+        ),
     ] = None,
-    place: Annotated[Path | None, typer.Option(help="Where the robot keeps its files.")] = None,
-    days: Annotated[int, typer.Option(min=1, help="Until the robot's certificate expires.")] = 825,
+    place: Annotated[Path | None, typer.Option(help="Folder of these files on the robot.")] = None,
+    days: Annotated[int, typer.Option(min=1, help="Validity of the robot's certificate.")] = 825,
     folder: FolderOption = HERE,
 ) -> None:
     """Make an authority and the robot's certificate and configuration; again: renew the robot's certificate.
@@ -49,12 +54,12 @@ def init(
 @app.command("add")
 def add(
     name: NameArgument,
-    role: Annotated[AccessRole | None, typer.Option(help="Its role; a new one: pilot.")] = None,
+    role: Annotated[AccessRole | None, typer.Option(help="Role; default for a new station: pilot.")] = None,
     rank: Annotated[
         Literal["gamepad", "keyboard", "station"] | None,
-        typer.Option(help="Highest priority it may claim; a new one: station."),
+        typer.Option(help="Highest priority it may claim; default for a new station: station."),
     ] = None,
-    days: Annotated[int, typer.Option(min=1, help="Until its certificate expires.")] = 365,
+    days: Annotated[int, typer.Option(min=1, help="Validity of its certificate.")] = 365,
     folder: FolderOption = HERE,
 ) -> None:
     """Certify a station; again: renew its certificate. Role and rank that are not given stay as they were."""
@@ -65,11 +70,11 @@ def add(
     target = kept.path / "stations" / name
     station = kept.register().stations[name]
     print(f"{name}: {station.role.value}, rank {station.rank.value}, {days} days; its files: {target}")
-    remark(f"To the station, into ~/.config/monstertruckd/tls: {shlex.quote(str(target))}/*")
+    remark(f"Copy to the station, into ~/.config/monstertruckd/tls: {shlex.quote(str(target))}/*")
     if changed:
         _say_robot(kept)
     else:
-        remark("The robot needs nothing: it knows the issuer.")
+        remark("The robot needs no new files: it already trusts the issuer.")
 
 
 @app.command("show")
@@ -114,10 +119,11 @@ def rules(folder: FolderOption = HERE) -> None:
 def router(
     robots: Annotated[list[Path], typer.Argument(help="Folders of the authorities of the fleet's robots.")],
     address: Annotated[
-        list[str], typer.Option("--address", "-a", help="Address or host name of the router; robots dial the first.")
+        list[str],
+        typer.Option("--address", "-a", help="Address or host name of the router; robots connect to the first."),
     ],
-    place: Annotated[Path | None, typer.Option(help="Where the router keeps its files.")] = None,
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Where it listens.")] = 7447,
+    place: Annotated[Path | None, typer.Option(help="Folder of these files on the router.")] = None,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Address to listen on.")] = 7447,
     folder: Annotated[
         Path, typer.Option("--folder", "-f", help="Folder of the router's authority.", show_default=False)
     ] = Path("router-security"),
@@ -131,13 +137,15 @@ def router(
     kept = [_folder(path) for path in robots]
     make_router(folder, kept, address, _now(), place or PLACE, port)
     print(f"router of {', '.join(each.register().robot for each in kept)}: its files: {folder / 'router'}")
-    remark(f"To the router, into {place or PLACE}: {shlex.quote(str(folder / 'router'))}/*; it starts with zenoh.json5")
-    remark("To every robot and station their folders again: they trust the router from now on.")
+    remark(
+        f"Copy to the router, into {place or PLACE}: {shlex.quote(str(folder / 'router'))}/*; start it with zenoh.json5"
+    )
+    remark("Copy their folders to every robot and station again, so that they trust the router.")
 
 
 @app.command("check")
 def check(
-    endpoint: Annotated[str, typer.Option("--endpoint", "-e", help="Where the running robot listens: tls/HOST:PORT.")],
+    endpoint: Annotated[str, typer.Option("--endpoint", "-e", help="Address of the running robot: tls/HOST:PORT.")],
     folder: FolderOption = HERE,
     json_output: JsonOption = False,
 ) -> None:
@@ -156,7 +164,7 @@ def check(
             ("who", "found", ""), [(c.who, c.found, "ok" if c.met else f"expected {c.expected}") for c in cases]
         )
     failed = [case.who for case in cases if not case.met]
-    finish(Reason.NOT_PERMITTED if failed else Reason.OK, f"not as it should be: {', '.join(failed)}")
+    finish(Reason.NOT_PERMITTED if failed else Reason.OK, f"wrong: {', '.join(failed)}")
 
 
 def _folder(path: Path) -> "Folder":
@@ -175,10 +183,12 @@ def _now() -> int:
 def _say_robot(folder: "Folder") -> None:
     register = folder.register()
     place = register.place
-    remark(f"To the robot, into {place} (robot.key readable by its daemon alone): {shlex.quote(str(folder.robot))}/*")
-    remark(f"The robot's configuration has `include: {place}/zenoh.yaml`. {RESTART}")
+    remark(
+        f"Copy to the robot, into {place} (robot.key readable by its daemon alone): {shlex.quote(str(folder.robot))}/*"
+    )
+    remark(f"The robot's configuration needs `include: {place}/zenoh.yaml`. {RESTART}")
     if register.router is not None:
-        remark("The router keeps to its old rules until `security router` is run again and it is restarted.")
+        remark("The router uses its old rules until `security router` is run again and it is restarted.")
     if not register.of_role(AccessRole.PILOT, AccessRole.ENGINEER):
-        remark("With these files it does not start: no station could drive.")
+        remark("The robot does not start with these files, because no station could drive it.")
         remark("Next: monstertruckd security add NAME --role pilot")

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 RootOption = Annotated[
-    Path, typer.Option("--root", help="System to write into instead of this one; then no program of it is run.")
+    Path, typer.Option("--root", help="Root folder to install into instead of this system; then no program is run.")
 ]
-DryOption = Annotated[bool, typer.Option("--dry-run", help="Only say what would be done.")]
+DryOption = Annotated[bool, typer.Option("--dry-run", help="Only print the actions.")]
 
 
 def install_service(
@@ -30,7 +30,7 @@ def install_service(
         typer.Option(
             "--config",
             "-c",
-            help="Configuration of the robot, copied to /etc/monstertruckd; default: the one that is there.",
+            help="Configuration of the robot, copied to /etc/monstertruckd; default: the installed one.",
             autocompletion=complete_config,
             callback=bundled,
         ),
@@ -38,16 +38,16 @@ def install_service(
     user: Annotated[
         str | None,
         typer.Option(
-            help="User the service runs as; made if there is none. Default: the one it runs as, or monstertruckd."
+            help="User that runs the service, created if missing. Default: the installed service's, or monstertruckd."
         ),
     ] = None,
-    start: Annotated[bool, typer.Option("--start", help="Start or restart the service as well.")] = False,
+    start: Annotated[bool, typer.Option("--start", help="Also start or restart the service.")] = False,
     upgrade: Annotated[
         bool,
         typer.Option(
             "--upgrade",
-            help="Run this version instead of the installed one, which comes back if this one does not become ready; "
-            "refused while the robot is armed.",
+            help="Install this version; the installed one is restored if it does not become ready. Refused "
+            "while the robot is armed.",
         ),
     ] = False,
     dry_run: DryOption = False,

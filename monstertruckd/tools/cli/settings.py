@@ -15,7 +15,7 @@ from monstertruckd.tools.cli.output import JsonOption, print_json, print_table, 
 
 
 def get(
-    key: Annotated[str | None, typer.Argument(help="Only what is at or below this key, e.g. gate.tilt.")] = None,
+    key: Annotated[str | None, typer.Argument(help="Only settings at or below this key, e.g. gate.tilt.")] = None,
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
     json_output: JsonOption = False,
@@ -31,7 +31,7 @@ def get(
     ]
     if not rows:
         raise NotFoundError(
-            f"{key}: no setting that may be changed while the robot runs; `monstertruckd get` lists all"
+            f"{key}: not a setting that can be changed while the robot runs; `monstertruckd get` lists them"
         )
     if json_output:
         print_json(rows)
@@ -46,7 +46,7 @@ def get(
 def set_value(
     key: Annotated[str, typer.Argument(help="Setting, e.g. gate.speed.")],
     value: Annotated[str, typer.Argument(help="New value, in the configuration's units.")],
-    save: Annotated[bool, typer.Option("--save", help="Keep it over restarts of the daemon.")] = False,
+    save: Annotated[bool, typer.Option("--save", help="Keep the value when the daemon restarts.")] = False,
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
     json_output: JsonOption = False,
@@ -63,7 +63,7 @@ def set_value(
     else:
         print(f"{key} is {value}" + (f", saved in {answer['file']}" if save else " until the daemon ends"))
     for text in answer["weakened"]:
-        remark(f"less safe than by default: {text}")
+        remark(f"less safe than the default: {text}")
 
 
 def _below(key: str, wanted: str | None) -> bool:

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from monstertruckd.tools.stand.analysis import EstimateError
     from monstertruckd.tools.stand.config import OverheadConfig
 
-app = command_group("The overhead test stand: cameras over a table that say where robots are.")
+app = command_group("The overhead test stand: cameras above a table that measure the poses of robots.")
 
-StandFile = Annotated[Path, typer.Option("--config", "-c", help="The stand's YAML.")]
+StandFile = Annotated[Path, typer.Option("--config", "-c", help="Configuration of the stand (YAML).")]
 
 
 @app.command("run")
@@ -69,9 +69,9 @@ def calibrate_command(config: StandFile, json_output: JsonOption = False) -> Non
         ]
         print_table(("camera", "lens px", "marks mm", "boards", "marks"), rows, right=("lens px", "marks mm"))
     if found.overlap_rms is None:
-        remark("no mark is seen by two cameras: nothing joins them")
+        remark("no mark is seen by two cameras, so their poses cannot be related: move a mark or a camera")
     else:
-        remark(f"cameras agree to {1000 * found.overlap_rms:.1f} mm on the marks that several see")
+        remark(f"cameras agree to {1000 * found.overlap_rms:.1f} mm on the marks seen by several")
     remark(f"saved in {stand.calibration}")
 
 
@@ -80,15 +80,15 @@ def calibrate_command(config: StandFile, json_output: JsonOption = False) -> Non
 def snap_command(
     config: StandFile,
     camera: Annotated[str, typer.Argument(help="Name of the camera.", show_default=False)],
-    folder: Annotated[Path, typer.Argument(help="Where the pictures go.", show_default=False)],
+    folder: Annotated[Path, typer.Argument(help="Folder for the images.", show_default=False)],
     count: Annotated[int, typer.Option(min=1, max=1000, help="Pictures.")] = 20,
-    every: Annotated[float, typer.Option(min=0.0, max=60, help="Seconds between two.")] = 2.0,
+    every: Annotated[float, typer.Option(min=0.0, max=60, help="Seconds between two images.")] = 2.0,
 ) -> None:
     """Take pictures with a camera: of the board, held anyhow, or of the table with its marks."""
     from monstertruckd.tools.cli.stand_session import snap
 
     snap(_load(config), camera, folder, count, every)
-    remark(f"wrote {count} pictures to {folder}")
+    remark(f"wrote {count} images to {folder}")
 
 
 @app.command("print")
@@ -96,8 +96,8 @@ def snap_command(
 def print_command(
     out: Annotated[Path, typer.Argument(help="Folder for the PNGs.", show_default=False)],
     tags: Annotated[str, typer.Option(help="Numbers of the tags: 0-3,100-134.")] = "0-3",
-    columns: Annotated[int, typer.Option(min=4, max=30, help="Squares of the board, across.")] = 8,
-    rows: Annotated[int, typer.Option(min=4, max=30, help="Squares of the board, down.")] = 6,
+    columns: Annotated[int, typer.Option(min=4, max=30, help="Number of squares across the board.")] = 8,
+    rows: Annotated[int, typer.Option(min=4, max=30, help="Number of squares down the board.")] = 6,
 ) -> None:
     """Tags and board to be printed; measure the print, and write its sizes into the stand's YAML."""
     from monstertruckd.tools.cli.stand_session import print_tags
@@ -108,7 +108,7 @@ def print_command(
 
 @app.command("analyse")
 def analyse_command(
-    log: Annotated[Path, typer.Argument(help="A robot's log with poses of a stand.", show_default=False)],
+    log: Annotated[Path, typer.Argument(help="Log of a robot with poses from a stand.", show_default=False)],
     json_output: JsonOption = False,
 ) -> None:
     """Errors of odometry, pose in map and tracker against the stand, and the stand's latency."""
@@ -140,7 +140,7 @@ def _print_errors(found: "list[EstimateError]", tracker: dict[str, float] | None
     headings = ("estimate", "poses", "rms mm", "end mm", "heading deg", "latency ms")
     print_table(headings, rows, right=headings[1:])
     if tracker is not None:
-        remark(f"tracker: {1000 * tracker['rms']:.0f} mm rms off its path by its own report")
+        remark(f"tracker: {1000 * tracker['rms']:.0f} mm rms deviation from its path, by its own report")
 
 
 def _load(path: Path) -> "OverheadConfig":

@@ -79,7 +79,7 @@ def snap(config: "OverheadConfig", name: str, folder: Path, count: int, every: f
         taken += 1
         if taken == count:
             return
-    raise InputError(f"camera {name} sent {taken} pictures: expected {count}")
+    raise InputError(f"camera {name} sent {taken} images: expected {count}")
 
 
 def print_tags(out: Path, numbers: str, columns: int, rows: int) -> Iterator[Path]:
@@ -137,11 +137,11 @@ class RobotLink:
                         try:
                             while (state := await gate.next_within(GONE)) is not None:
                                 self._ways.append(self._clock.now() - state.stamp)
-                                self._report("gets its poses")
+                                self._report("receives its poses")
                         finally:
                             self._client = None
                             self._ways.clear()
-                    self._report("is not there, or silent")
+                    self._report("is silent or not running")
             except NotFoundError:
                 self._report(f"no robot answers at {self._endpoint}")
             except TruckError as error:
@@ -198,7 +198,7 @@ def _tracker(config: "OverheadConfig", now: int) -> Any:
 
     placed = load(config.calibration).placed()
     if missing := config.cameras.keys() - placed.keys():
-        raise InputError(f"{config.calibration}: {', '.join(sorted(missing))} not in it: run `stand calibrate` again")
+        raise InputError(f"{config.calibration}: lacks {', '.join(sorted(missing))}: run `stand calibrate` again")
     return StandTracker({name: placed[name] for name in config.cameras}, config.robots, config.marks, now, config.blobs)
 
 

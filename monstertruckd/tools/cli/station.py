@@ -36,7 +36,10 @@ def station(
     ] = None,
     port: Annotated[int, typer.Option("--port", "-p", min=1, max=65535, help="Port of the page.")] = 8470,
     host: Annotated[
-        str, typer.Option("--host", help="Address to serve on; another than the loopback one needs the next three.")
+        str,
+        typer.Option(
+            "--host", help="Address to serve on; an address other than loopback needs the next three options."
+        ),
     ] = "127.0.0.1",
     certificate: Annotated[
         Path | None, typer.Option("--certificate", help="Certificate of the page (PEM, with its chain).")
@@ -44,20 +47,22 @@ def station(
     key: Annotated[Path | None, typer.Option("--key", help="Its private key (PEM).")] = None,
     users: Annotated[Path | None, typer.Option("--users", help="File of the users who may log in.")] = None,
     name: Annotated[
-        list[str] | None, typer.Option("--name", help="Further name of this machine, in the page's address.")
+        list[str] | None, typer.Option("--name", help="Additional host name of this machine in the page's URL.")
     ] = None,
     add_user: Annotated[
         str | None,
-        typer.Option("--add-user", metavar="USER", help="Add a user to --users, asking for a password; end."),
+        typer.Option("--add-user", metavar="USER", help="Add a user to --users, ask for the password, and exit."),
     ] = None,
     role: Annotated[AccessRole, typer.Option("--role", help="Role of the added user.")] = AccessRole.PILOT,
     foxglove: Annotated[
         bool, typer.Option("--foxglove", help="Also serve the first robot to Foxglove's app on this machine.")
     ] = False,
-    foxglove_port: Annotated[int, typer.Option("--foxglove-port", min=1, max=65535, help="Port of that.")] = 8765,
+    foxglove_port: Annotated[int, typer.Option("--foxglove-port", min=1, max=65535, help="Port for Foxglove.")] = 8765,
     foxglove_drive: Annotated[
         bool,
-        typer.Option("--foxglove-drive", help="Let Foxglove drive and arm: any page in a browser here could, too."),
+        typer.Option(
+            "--foxglove-drive", help="Let Foxglove drive and arm; any page in a browser on this machine could, too."
+        ),
     ] = False,
     rerun: Annotated[
         bool, typer.Option("--rerun", help="Also show the first robot in a running rerun viewer on this machine.")
@@ -91,7 +96,7 @@ def station(
     known = None if users is None else station_users.StationUsers(users)
     place = Place(host, port, _tls(certificate, key), known, tuple(name or ()))
     if (foxglove or foxglove_drive or rerun) and not addresses:
-        raise typer.BadParameter("a viewer shows one robot: expected --robot NAME@ENDPOINT")
+        raise typer.BadParameter("a viewer shows one robot: pass --robot NAME@ENDPOINT")
 
     async def serve(clock: "WallClock") -> None:
         page = Station(addresses, clock, place, routers or (), open_log, calibrator=PageCalibrator(clock))
@@ -134,7 +139,7 @@ def _tls(certificate: Path | None, key: Path | None) -> "SSLContext | None":
     if certificate is None and key is None:
         return None
     if certificate is None or key is None:
-        raise InputError("expected --certificate and --key together")
+        raise InputError("pass --certificate and --key together")
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     try:
         context.load_cert_chain(certificate, key)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from monstertruckd.tools.study.report import Result
     from monstertruckd.tools.study.runs import Stretch
 
-app = command_group("The skid-steer study: circles and passes by wheel speeds, open loop, and what a test stand saw.")
+app = command_group("The skid-steer study: circles and straight passes by wheel speeds, open loop, and their analysis.")
 
 Reference = Annotated[float, typer.Option(help="Rate of the faster side's wheels, rad/s.")]
 
@@ -31,7 +31,7 @@ Reference = Annotated[float, typer.Option(help="Rate of the faster side's wheels
 def circle_command(
     ratio: Annotated[float, typer.Option(help="Ratio of the wheel rates: 2, 3, or inf (left side locked).")] = 2.0,
     reference: Reference = 1.57,
-    laps: Annotated[float, typer.Option(help="Laps of the ideal robot; one that skids turns less.")] = 5.0,
+    laps: Annotated[float, typer.Option(help="Laps of the ideal robot; a robot that skids turns less.")] = 5.0,
     robot: RobotOption = "skid_stand",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
 ) -> None:
@@ -45,7 +45,7 @@ def circle_command(
 @app.command("straight")
 def straight_command(
     length: Annotated[float, typer.Option(help="Length of a pass, m.")] = 0.682,
-    passes: Annotated[int, typer.Option(help="To and fro.")] = 12,
+    passes: Annotated[int, typer.Option(help="Number of passes there and back.")] = 12,
     reference: Reference = 1.57,
     robot: RobotOption = "skid_stand",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
@@ -116,7 +116,7 @@ def _results(runs: "list[Run]") -> "list[Result]":
     if not results:
         raise wrong[0]
     for why in wrong:
-        remark(f"left out: {why}")
+        remark(f"skipped: {why}")
     return results
 
 

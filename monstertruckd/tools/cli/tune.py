@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from monstertruckd.tools.tune.recipe import WallGains
     from monstertruckd.tools.tune.runs import TuningRun
 
-app = command_group("Gains found by runs of the robot.")
+app = command_group("Find controller gains with test runs of the robot.")
 
 
 @app.command("wall")
@@ -26,7 +26,9 @@ def wall_command(
     name: Annotated[str, typer.Argument(help="A behaviour of kind wall_pd.")] = "wall_left",
     first: Annotated[float, typer.Option(min=0.1, max=100, help="K_p of the first run.")] = 6.0,
     seconds: Annotated[float, typer.Option(min=4, max=60, help="Seconds of following in each run.")] = 8.0,
-    plot: Annotated[Path | None, typer.Option("--plot", help="PNG of all runs.", show_default=False)] = None,
+    plot: Annotated[
+        Path | None, typer.Option("--plot", help="PNG file with the figure of all runs.", show_default=False)
+    ] = None,
     robot: RobotOption = "sonar",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
 ) -> None:
@@ -61,5 +63,7 @@ def wall_command(
             draw(runs, plot)
             remark(f"wrote {plot}")
     if best is None:
-        raise NotFoundError("no gains were calm: the sonars' noise or a lag swings it; try another --first")
+        raise NotFoundError(
+            "no gains gave a calm run: noise of the sonars or a lag causes oscillation; try another --first"
+        )
     print_table(("k_p", "k_d"), [(f"{best.k_p:.3g}", f"{best.k_d:.3g}")], right=("k_p", "k_d"))

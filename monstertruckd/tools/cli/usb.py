@@ -15,7 +15,7 @@ from monstertruckd.tools.cli.output import JsonOption, console, on_terminal, pri
 def usb(
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
-    local: Annotated[bool, typer.Option("--local", help="This machine's own tree, without a daemon.")] = False,
+    local: Annotated[bool, typer.Option("--local", help="Show this machine's USB tree, without a daemon.")] = False,
     json_output: JsonOption = False,
 ) -> None:
     """List USB hubs, ports and devices of a running robot, with role, state and replugs."""
@@ -31,7 +31,7 @@ def usb(
         print_json(nodes)
     elif not nodes:
         remark(
-            "no USB hub on this machine" if local else f"robot {robot!r} sees no USB hub; --local shows this machine's"
+            "no USB hub on this machine" if local else f"robot {robot!r} has no USB hub; --local shows this machine's"
         )
     elif on_terminal(sys.stdout):
         console().print(*draw(nodes), sep="\n")
@@ -45,9 +45,9 @@ def find_port(
         typer.Argument(help="Role of the device: lidar, drive, steering, compass ...", autocompletion=complete_role),
     ],
     write: Annotated[
-        Path | None, typer.Option("--write", "-w", help="Configuration file to put the port into.")
+        Path | None, typer.Option("--write", "-w", help="Configuration file to write the port to.")
     ] = None,
-    wait: Annotated[float, typer.Option(min=0.1, help="Seconds to wait for the cable.")] = 60.0,
+    wait: Annotated[float, typer.Option(min=0.1, help="Seconds to wait until the cable is unplugged.")] = 60.0,
     json_output: JsonOption = False,
 ) -> None:
     """Unplug the cable: this names its hub and port and prints the line for the configuration."""

@@ -32,7 +32,7 @@ async def robot_tree(client: TruckClient) -> tuple[UsbNode, ...]:
     """
     tree = await client.get_retained(USB)
     if tree is None:
-        raise NotFoundError(f"robot {client.robot!r} watches no USB tree; --local shows this machine's")
+        raise NotFoundError(f"robot {client.robot!r} does not watch its USB tree; --local shows this machine's")
     return tree.nodes
 
 
@@ -66,7 +66,7 @@ def draw(nodes: Iterable[UsbNode]) -> list[Tree]:
 def _label(name: str, node: UsbNode | None) -> Text:
     label = Text(name if parent_of(name) is None else f"port {port_of(name)}", style="dim")
     if node is None:
-        return label.append(f"  {name} never seen", style=STATE_STYLE[UsbState.ABSENT])
+        return label.append(f"  {name} never connected", style=STATE_STYLE[UsbState.ABSENT])
     if node.hub:
         label.append(f"  hub {name}", style="bold")
     if node.role is not None:

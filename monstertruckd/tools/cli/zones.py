@@ -39,7 +39,7 @@ def list_command(
                 async with clock.deadline(wait):
                     return await box.next(), (await gate.next()).stamp
             except TimeoutError:
-                text = f"no list of zones within {wait:g} s"
+                text = f"no list of zones received within {wait:g} s"
                 raise NoAnswerError(text + await not_ready(client)) from None
 
     known, now = with_robot(main, robot, endpoint, named=False)
@@ -62,7 +62,8 @@ def add_command(
         float | None, typer.Option("--limit", help="Maximum speed (m/s): a speed zone.", show_default=False)
     ] = None,
     leave: Annotated[
-        bool, typer.Option("--leave", help="A robot inside leaves slowly, instead of standing.", show_default=False)
+        bool,
+        typer.Option("--leave", help="A robot inside drives out slowly instead of standing still.", show_default=False),
     ] = False,
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
@@ -88,7 +89,7 @@ def remove_command(
 @app.command("off")
 def off_command(
     name: NameArgument,
-    duration: Annotated[str, typer.Option("--for", help="How long, at most 24h.", metavar="TIME")] = "10min",
+    duration: Annotated[str, typer.Option("--for", help="Duration, at most 24h.", metavar="TIME")] = "10min",
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
 ) -> None:

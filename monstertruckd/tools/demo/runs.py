@@ -242,7 +242,7 @@ async def _ready(said: Callable[[], bytes], clock: Clock) -> AsyncIterator[None]
             while b"ready" not in said():
                 await clock.sleep(0.05)
     except TimeoutError:
-        raise NoAnswerError(f"the simulator did not come up within {START_LIMIT:g} s: {said()!r}") from None
+        raise NoAnswerError(f"the simulator did not start within {START_LIMIT:g} s: {said()!r}") from None
     yield
 
 
@@ -297,7 +297,7 @@ async def connect(clock: Clock, robot: str, endpoint: str) -> TruckClient:
                 except NotFoundError:
                     await clock.sleep(0.2)
     except TimeoutError:
-        raise NoAnswerError(f"the daemon did not come up within {START_LIMIT:g} s at {endpoint}") from None
+        raise NoAnswerError(f"the daemon did not start within {START_LIMIT:g} s at {endpoint}") from None
     return TruckClient(robot, endpoint, source=f"demo:{os.getpid()}", clock=clock)
 
 

@@ -108,7 +108,7 @@ class Summary:
         if not (self.lap.stops and self.lateness_p99 > 0.02):
             return []
         return [
-            ("busy computer", f"ticks came {self.lateness_p99 * 1e3:.0f} ms late: end other programs, or use --fast")
+            ("busy computer", f"ticks were {self.lateness_p99 * 1e3:.0f} ms late: end other programs, or use --fast")
         ]
 
     def _closing_row(self) -> list[tuple[str, str]]:

@@ -40,13 +40,13 @@ def calendar(context: HostContext) -> Iterator[Finding]:
     elif context.at(SYNCHRONIZED).exists():
         yield fine("clock", "synchronized by systemd-timesyncd")
     elif keeper is not None:
-        yield fine("clock", f"kept by {keeper}")
+        yield fine("clock", f"set by {keeper}")
     else:
-        yield warn("clock", Reason.CLOCK_UNSET, "nothing synchronizes it: logs may carry a wrong date", set_ntp)
+        yield warn("clock", Reason.CLOCK_UNSET, "no time service sets it: logs may carry a wrong date", set_ntp)
     if any((context.computer.root / "sys/class/rtc").glob("rtc*")):
         yield fine("clock chip", "there")
     else:
-        seen = "none: after a start without network the date continues from the last shutdown, until NTP steps it"
+        seen = "none: after a start without network the clock continues from the last shutdown until NTP sets it"
         yield fine("clock chip", seen)
 
 
@@ -75,9 +75,9 @@ def condition(context: HostContext) -> Iterator[Finding]:
     heat = "not measured" if host.temperature is None else f"{host.temperature:.0f} degrees"
     slow = host.frequency_share is not None and host.frequency_share < limits.slow
     if host.temperature is not None and host.temperature > limits.hot:
-        yield warn("heat", Reason.HOST_HOT, f"{heat}: let it cool, give it air or a fan")
+        yield warn("heat", Reason.HOST_HOT, f"{heat}: let it cool, improve its ventilation")
     elif host.firmware_throttled or slow:
-        seen = f"{heat}, but the processor is throttled: temperature or supply voltage"
+        seen = f"{heat}, but the processor is throttled: check temperature and supply voltage"
         yield warn("heat", Reason.HOST_THROTTLED, seen, "grep . /sys/devices/system/cpu/cpu*/cpufreq/scaling_max_freq")
     else:
         yield fine("heat", heat)
@@ -115,7 +115,7 @@ def wireless(context: HostContext) -> Iterator[Finding]:
         if kind:
             yield warn("wireless", Reason.LINK_OPEN, f"{name} is {kind}: anyone in range can listen and send; use WPA2")
     if found and not any(found.values()):
-        yield fine("wireless", f"{', '.join(found)}: with a key")
+        yield fine("wireless", f"{', '.join(found)}: encrypted")
 
 
 def _security(text: str, weak: str, keyed: str) -> str:
@@ -140,7 +140,7 @@ def card(context: HostContext) -> Iterator[Finding]:
             continue
         seen = f"{folder.name}: {10 * (tenths - 1)} to {10 * tenths} % of its life is used"
         if tenths >= 8 or worn > 1:  # wear before a card should be replaced, tenths of its life
-            yield warn("card", Reason.RECORDING_FAILED, f"{seen}: copy it to a new one")
+            yield warn("card", Reason.RECORDING_FAILED, f"{seen}: copy it to a new card")
         else:
             yield fine("card", seen)
 
@@ -152,7 +152,7 @@ def access(context: HostContext) -> Iterator[Finding]:
     zenoh = context.config.zenoh
     if zenoh.open_endpoints:
         seen = (
-            f"{', '.join(zenoh.open_endpoints)}: anyone who reaches it may drive the robot; use tls/... with zenoh.tls"
+            f"{', '.join(zenoh.open_endpoints)}: anyone on the network may drive the robot; use tls/... with zenoh.tls"
         )
         yield fail("access", Reason.LINK_OPEN, seen)
     elif zenoh.certified_endpoints:
@@ -163,7 +163,7 @@ def access(context: HostContext) -> Iterator[Finding]:
         names = ", ".join(f"{name} ({grant.role})" for name, grant in zenoh.tls.grants().items())
         seen = (
             f"{names}; Zenoh silently drops requests under names that the certificate lacks; "
-            "`monstertruckd security check` tries what each role may do"
+            "`monstertruckd security check` tests the rights of each role"
         )
         yield fine("names", seen)
         for file in dict.fromkeys((zenoh.tls.ca, zenoh.tls.pilots_ca, zenoh.tls.certificate, zenoh.tls.key)):
@@ -189,7 +189,7 @@ def _file(context: HostContext, file: Path, *, private: bool) -> Iterator[Findin
         fix = f"sudo chown {context.account.name} {file}"
         yield fail("tls", Reason.NOT_PERMITTED, f"{context.account.name} may not read {file}", fix)
     elif private and status.st_mode & 0o077:
-        yield warn("tls", Reason.LINK_OPEN, f"{file}: others may read the private key", f"sudo chmod 600 {file}")
+        yield warn("tls", Reason.LINK_OPEN, f"{file}: other users may read the private key", f"sudo chmod 600 {file}")
     if not private:
         yield _expiry(context, file, place) if os.access(place, os.R_OK) else _not_checked(context, file)
 
@@ -209,11 +209,11 @@ def _expiry(context: HostContext, file: Path, place: Path) -> Finding:
         )
     if days < 30:  # days
         return warn("certificate", Reason.NOT_PERMITTED, f"{file}: certificate of {name} expires in {days} days", show)
-    return fine("certificate", f"{file}: good for {days} days")
+    return fine("certificate", f"{file}: valid for {days} days")
 
 
 def _not_checked(context: HostContext, file: Path) -> Finding:
-    seen = f"{file}: not checked, this user may not read it"
+    seen = f"{file}: not checked, because this user may not read it"
     return warn("tls", Reason.NOT_PERMITTED, seen, context.command("doctor", sudo=True))
 
 

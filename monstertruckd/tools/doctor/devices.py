@@ -23,7 +23,7 @@ from monstertruckd.tools.doctor.context import Finding, HostContext, fail, fine,
 MODULES = {"0403": "ftdi_sio", "10c4": "cp210x", "067b": "pl2303"}
 """Kernel modules by vendor; all others are USB-CDC."""
 MODPROBE_I2C: Final = "sudo modprobe i2c-dev"
-SUPPLY: Final = "what hangs there draws too much, or its cable is damaged: use a hub with a supply of its own"
+SUPPLY: Final = "the devices there draw too much current, or the cable is damaged: use a self-powered hub"
 
 
 def wiring(context: HostContext) -> Iterator[Finding]:
@@ -46,7 +46,9 @@ def wiring(context: HostContext) -> Iterator[Finding]:
     for name, count in tree.over_current.items():
         if count and name in taken:
             yield warn(
-                "over-current", Reason.OVER_CURRENT, f"{place(name)}: {count} times since its hub came: {SUPPLY}"
+                "over-current",
+                Reason.OVER_CURRENT,
+                f"{place(name)}: {count} times since its hub was connected: {SUPPLY}",
             )
 
 
@@ -62,7 +64,7 @@ def _by_command(role: str, port: CommandPortConfig) -> Finding:
 def _by_path(context: HostContext, role: str, device: Device[Any]) -> Finding:
     node = context.node(device.port)
     if node is None:
-        seen = f"{device.port.label}: no such node"
+        seen = f"{device.port.label}: does not exist"
         if device.kind.opens == "i2c":
             return fail(role, Reason.DEVICE_LOST, f"{seen}; enable the bus in the computer's settings", MODPROBE_I2C)
         return fail(role, Reason.DEVICE_LOST, seen, context.find_port_command(role))
@@ -104,7 +106,7 @@ def _absent(context: HostContext, tree: TreeSnapshot, role: str, port: UsbPortCo
     where = place(port.device)
     gone = next((hub for hub in [*ancestors(port.device)][::-1] if hub not in tree.devices), None)
     if gone is not None:
-        seen = f"{where}: hub {gone} is not there"
+        seen = f"{where}: hub {gone} is missing"
         return fail(role, Reason.HUB_LOST, seen, context.command("usb", "--local"))
     alike = (name for name, device in tree.devices.items() if device.usb_id == port.usb_id and name not in taken)
     elsewhere = next(alike, None)
@@ -116,7 +118,7 @@ def _absent(context: HostContext, tree: TreeSnapshot, role: str, port: UsbPortCo
 
 def _settings(role: str, port: UsbPortConfig, device: UsbDevice, node: Node) -> Iterator[Finding]:
     if node.latency_ms is not None and node.latency_ms > port.latency_ms:
-        seen = f"{node.name} answers after {node.latency_ms} ms instead of {port.latency_ms} ms"
+        seen = f"{node.name} has a latency of {node.latency_ms} ms instead of {port.latency_ms} ms"
         fix = f"echo {port.latency_ms} | sudo tee /sys/{node.path}/latency_timer"
         yield warn(f"{role} latency", Reason.SLOW_LINK, seen, fix)
     if device.autosuspend:
@@ -131,7 +133,7 @@ async def handshakes(context: HostContext) -> AsyncIterator[Finding]:
         return
     daemon = context.daemon()
     if daemon is not None:
-        seen = f"not tried: the running daemon (process {daemon}) has the ports"
+        seen = f"not tested: the running daemon (process {daemon}) uses the ports"
         yield fine("handshakes", seen, context.command("status", "--once"))
         return
     plugged = {
@@ -167,7 +169,7 @@ async def _handshake(context: HostContext, role: str, device: Device[Schema], pl
     except DeviceError as error:
         return fail(check, error.reason, str(error), again)
     if kind.opens == "video" and not any(one.get("mjpg_modes") for one in answer["nodes"]):
-        return warn(check, Reason.DEVICE_WRONG, f"{place} offers no motion JPEG", again)
+        return warn(check, Reason.DEVICE_WRONG, f"{place} does not offer motion JPEG", again)
     return fine(check, f"{kind.doc} answers")
 
 

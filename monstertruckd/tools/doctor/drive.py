@@ -58,7 +58,7 @@ async def signs(drives: Drives, config: TruckConfig, command: Callable[..., str]
     """
     chassis = config.chassis()
     if not isinstance(chassis, TruckChassis):
-        text = f"body {config.body.kind}: only one with two steered axles is driven"
+        text = f"body {config.body.kind}: the test drive needs two steered axles"
         return [warn("signs", Reason.NOT_SUPPORTED, text)]
     present = config.devices.present()
     also = tuple(topic for role, topic in (("lidar", topics.SCAN), ("imu", topics.IMU)) if role in present)
@@ -145,7 +145,9 @@ def judged(moves: list[Movement], command: Callable[..., str]) -> Iterator[Findi
     """Findings of all moves together: turns and distances of a move back count with their signs."""
     turn = sum(abs(move.turn) for move in moves)
     if turn < 0.1:  # minimum turn of all moves together to judge a sign, rad
-        text = f"motor and steering turned it by {math.degrees(turn):.0f} degrees in all: too little for a sign"
+        text = (
+            f"motor and steering turned it by {math.degrees(turn):.0f} degrees in total: too little to determine a sign"
+        )
         yield warn("signs", Reason.STEERING_DEAD, text)
         return
     shares = shares_of_turn(moves)
@@ -159,22 +161,27 @@ def judged(moves: list[Movement], command: Callable[..., str]) -> Iterator[Findi
     )
     backward = along < 0.0
     if backward and "lidar" in against:
-        seen = "by the lidar it goes back where the motor counts ahead: the motor's sign is wrong"
+        seen = "the lidar shows backward motion while the motor counts forward: the motor's sign is wrong"
         yield fail("sign motor", Reason.BAD_CONFIG, seen, command(*SIGN_ONLY.split()))
     elif backward:
-        seen = "by the lidar it goes back where the motor counts ahead, and turns as it should: the lidar looks back"
-        yield fail("sign lidar", Reason.BAD_CONFIG, f"{seen} (its mount's yaw is near 3.14), or motor and steering err")
+        seen = (
+            "the lidar shows backward motion while the motor counts forward, but the right turn: the lidar "
+            "faces backwards"
+        )
+        yield fail(
+            "sign lidar", Reason.BAD_CONFIG, f"{seen} (its mount's yaw is near 3.14), or motor and steering are wrong"
+        )
     elif along > 0.0:
-        yield fine("sign motor", "the lidar sees it go where the motor counts")
+        yield fine("sign motor", "the lidar shows motion in the direction that the motor counts")
     elif "lidar" in shares:
-        yield fine("sign motor", "not seen: the walls look alike all along the way; drive where one is ahead")
+        yield fine("sign motor", "not determined: the walls look alike along the whole path; drive with a wall ahead")
     if shares and not agree and not against:
-        seen = f"{', '.join(shares)} saw nothing of the turn: the direction of one axle is wrong, or a servo is loose"
+        seen = f"{', '.join(shares)} measured no turn: the direction of one axle is wrong, or a servo is loose"
         yield fail("sign steering", Reason.STEERING_DEAD, seen, command(*ROUGH.split()))
     elif agree or not against:
         yield from _turns(shares, against, [name for name in agree if not (backward and name == "lidar")])
     elif not backward:  # a motor that turns the other way turns the robot the other way, too
-        seen = f"{', '.join(against)} turned against the steering: the wheels' directions are wrong"
+        seen = f"{', '.join(against)} turned opposite to the steering: the directions of the wheels are wrong"
         yield fail("sign steering", Reason.STEERING_DEAD, seen, command(*ROUGH.split()))
 
 
@@ -196,10 +203,10 @@ def _turns(shares: Mapping[str, float], against: Sequence[str], agree: Sequence[
     """Findings about sensors that turned with motor and steering, against them, or hardly."""
     for name, share in shares.items():
         if name in against:
-            seen = f"it turns against the steering and the {', '.join(agree)}: it is mounted upside down"
+            seen = f"it turns opposite to the steering and the {', '.join(agree)}: it is mounted upside down"
             yield fail(f"sign {name}", Reason.BAD_CONFIG, seen)
         elif name in agree:
-            yield fine(f"sign {name}", "turns as motor and steering do")
+            yield fine(f"sign {name}", "turns like motor and steering")
         elif abs(share) <= CLEAR:
-            seen = f"it saw {share:.0%} of the turn by motor and steering: it is stuck, or far from right"
+            seen = f"it measured {share:.0%} of the turn by motor and steering: it is stuck, or its scale is wrong"
             yield warn(f"sign {name}", Reason.DEVICE_FAULT, seen)

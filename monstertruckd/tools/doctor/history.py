@@ -20,8 +20,14 @@ from monstertruckd.tools.doctor.context import Finding, HostContext, fail, fine,
 
 AT_LIMIT: Final = math.radians(0.5)
 COUNTED: Final = {
-    Reason.DEVICE_RESTARTED: ("brown-out", "a device lost its supply and came back: measure it while the motor starts"),
-    Reason.CLOCK_STEPPED: ("clock steps", "the real time jumped: set it before the drive, or log dates are wrong"),
+    Reason.DEVICE_RESTARTED: (
+        "brown-out",
+        "a device lost its supply and came back: measure the voltage while the motor starts",
+    ),
+    Reason.CLOCK_STEPPED: (
+        "clock steps",
+        "the system time jumped: set the clock before the drive, or log dates are wrong",
+    ),
     Reason.HOST_THROTTLED: ("throttled", "the processor was throttled: cool it, and measure its supply"),
     Reason.OVER_CURRENT: ("over-current", "a hub's port was overloaded: use a supplied hub"),
 }
@@ -62,10 +68,10 @@ def calibration(context: HostContext) -> Iterator[Finding]:
         if state.expired:
             yield warn(f"calibration {name}", Reason.CALIBRATION_EXPIRED, state.expired, again)
         elif state.grade == "C":
-            seen = "grade C: its intervals are more than twice as wide as meant"
+            seen = "grade C: its intervals are more than twice as wide as intended"
             yield warn(f"calibration {name}", Reason.CALIBRATION_EXPIRED, seen, again)
         else:
-            yield fine(f"calibration {name}", f"grade {state.grade}, counts until {state.until[:10]}")
+            yield fine(f"calibration {name}", f"grade {state.grade}, valid until {state.until[:10]}")
 
 
 def newest_log(context: HostContext) -> Iterator[Finding]:
@@ -146,11 +152,11 @@ def _signs(series: dict[str, Any], log: str) -> Iterator[Finding]:
             yield fail(
                 f"sign {what}",
                 Reason.STEERING_DEAD,
-                f"in {log} it turns against the wheels: mounted upside down, or the wheels' directions are wrong "
-                "(calibrate drive --sign-only, calibrate steering --rough)",
+                f"in {log} it turns opposite to the wheels: mounted upside down, or the wheels' "
+                "directions are wrong (calibrate drive --sign-only, calibrate steering --rough)",
             )
         elif agreement > 0.5:
-            yield fine(f"sign {what}", "turns as the wheels do")
+            yield fine(f"sign {what}", "turns like the wheels")
 
 
 def _message(entry: Any) -> Any:

@@ -29,7 +29,7 @@ def python(context: HostContext, machine: str = platform.machine()) -> Iterator[
     if machine in MACHINES:
         yield fine("python", seen)
     else:
-        text = f"{seen}: numpy, scipy and numba come ready-made for {' and '.join(MACHINES)} only"
+        text = f"{seen}: wheels of numpy, scipy and numba exist for {' and '.join(MACHINES)} only"
         yield warn("python", Reason.NOT_SUPPORTED, text, "uname -m")
 
 
@@ -52,14 +52,14 @@ def packages(context: HostContext, requirements: list[str] | None = None) -> Ite
     ours = sorted(extra for extra in OURS if missing.get(extra))
     seen = f"installed: {', '.join(extra for extra in whole if extra not in OURS) or 'none'}"
     seen += f"; incomplete: {'; '.join(rest)}" if rest else ""
-    yield fine("extras", f"{seen}; for work on the project, not all there: {', '.join(ours)}" if ours else seen)
+    yield fine("extras", f"{seen}; incomplete, needed for development only: {', '.join(ours)}" if ours else seen)
 
 
 def configuration(context: HostContext) -> Iterator[Finding]:
     """Whether there is one, and it is accepted."""
     file = context.config_file
     if file is None:
-        seen = "none named and none installed: devices were not checked"
+        seen = "no configuration given or installed: devices were not checked"
         yield warn("config", Reason.NOT_FOUND, seen, context.command("doctor", "--config", "FILE"))
     elif context.refusal is not None:
         yield fail("config", Reason.BAD_CONFIG, context.refusal, context.command("config", "show", str(file)))
@@ -80,14 +80,17 @@ def motion(context: HostContext) -> Iterator[Finding]:
     ways = [name for name, there in (("scans", scans), ("free wheels", devices.encoders)) if there is not None]
     turns = [name for name, there in (("compass", devices.compass), ("gyroscope", devices.imu)) if there is not None]
     if compared is None or not (ways or turns):
-        seen = "only the wheels measure the motion: half of the speed limits; add a lidar, a compass or an IMU"
+        seen = "only the wheels measure the motion: speed limits are halved; add a lidar, a compass or an IMU"
         yield warn("motion", Reason.UNWITNESSED, seen)
         return
     seen = f"measured by wheels, {', '.join((*ways, *turns))}"
     if not ways:
-        seen += "; distances by the wheels alone: a lidar or encoders of free wheels would find wheels that lie"
+        seen += (
+            "; distance is measured by the wheels only: a lidar or encoders of free wheels would detect "
+            "wrong wheel counts"
+        )
     elif not turns:
-        seen += "; of two that disagree none can be named: a compass or an IMU would tell"
+        seen += "; if two sensors disagree, the faulty one cannot be identified: add a compass or an IMU"
     yield fine("motion", seen)
     if scans == "kiss" and context.versions("kiss-icp") is None:
         text = "kiss-icp is not installed: this repository's own scan odometry measures the motion"
@@ -95,7 +98,7 @@ def motion(context: HostContext) -> Iterator[Finding]:
         yield warn("scan odometry", Reason.NOT_INSTALLED, text, _install_command(context, kiss))
     missing = [name for name in SCAN_LIBRARIES if context.versions(name) is None]
     if scans is not None and missing:
-        text = f"{', '.join(missing)} not installed: the motion by scans is not measured"
+        text = f"{', '.join(missing)} not installed: the motion is not measured by scans"
         lacking = [Requirement.parse(name) for name in missing]
         yield warn("scan odometry", Reason.NOT_INSTALLED, text, _install_command(context, lacking))
 
@@ -114,8 +117,9 @@ def contact(context: HostContext) -> Iterator[Finding]:
         yield fine("contact", f"shown by {', '.join(shown)}")
         return
     seen = (
-        "no sensor shows that the wheels slip at an obstacle: the robot arrives at up to "
-        f"{config.gate.speed:g} m/s and pushes with up to {config.geometry.pull:g} N; add free wheels or a lidar"
+        "no sensor shows wheels slipping at an obstacle: the robot hits it at up to "
+        f"{config.gate.speed:g} m/s and pushes with up to {config.geometry.pull:g} N; add free wheels or "
+        "a lidar"
     )
     yield warn("contact", Reason.CONTACT, seen)
 
@@ -156,7 +160,7 @@ def _install_command(context: HostContext, lacking: Sequence[Requirement]) -> st
 async def service(context: HostContext) -> AsyncIterator[Finding]:
     """Whether the service is installed, up to date and running."""
     if not context.at(UNIT).is_file():
-        seen = "not installed: nothing starts the daemon, and nothing stops the robot when it dies"
+        seen = "not installed: the daemon is not started at boot, and the robot is not stopped when it dies"
         yield warn("service", Reason.NOT_INSTALLED, seen, context.install_command())
         return
     if stale := _stale(context):
@@ -188,9 +192,9 @@ def rules(context: HostContext) -> Iterator[Finding]:
     if not context.runs("ModemManager"):
         yield fine("ModemManager", "does not run")
     elif installed:
-        yield fine("ModemManager", "runs, and ignores the robot's ports")
+        yield fine("ModemManager", "runs, but ignores the robot's ports")
     else:
-        seen = "runs, and sends commands to serial ports that it takes for modems"
+        seen = "runs, and sends modem commands to serial ports"
         yield warn("ModemManager", Reason.NOT_INSTALLED, seen, context.install_command())
 
 

@@ -86,7 +86,7 @@ class PadLink:
                 file = os.open(path, os.O_RDWR | os.O_NONBLOCK)
             except OSError as error:
                 if error.errno == errno.EACCES:
-                    self.hint = f"{path}: not permitted (group input)"
+                    self.hint = f"{path}: permission denied; add the user to the group input"
                 continue
             pad = described(file, self._mapping)
             if pad is not None:

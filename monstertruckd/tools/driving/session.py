@@ -43,7 +43,7 @@ QUIET: Final = frozenset({Reason.CLIPPED, Reason.SERVO_LIMIT, Reason.ASSISTED})
 HELP = "Enter arm  WASD drive  space E-STOP  Esc stop  r reset  x straight  q end"
 ARROWS = {1: "▲ forward", -1: "▼ back", 0: "standing"}
 HINTS = {
-    None: "no state of the gate yet",
+    None: "no gate state received yet",
     GateMode.DISARMED: "disarmed: Enter arms",
     GateMode.ESTOPPED: "emergency stop: r resets, then Enter arms",
 }
@@ -294,7 +294,7 @@ def _controls(state: ScreenState, teleop: Teleop, stream: Stream) -> Panel:
     body.add_row(_modes(teleop))
     body.add_row(Text(HELP, style="dim", no_wrap=True, overflow="ellipsis"))
     body.add_row(_message(state, stream))
-    title = "drive: moves only while a key is held" + (f" · {stream.pad}" if stream.pad else "")
+    title = "drive: the robot moves only while a key is held" + (f" · {stream.pad}" if stream.pad else "")
     return Panel(body, title=title, border_style="dim")
 
 

@@ -152,7 +152,9 @@ def place_of(root: Path, path: Path) -> Path:
     place = below(root, path)
     folder = place.parent.resolve()
     if not folder.is_relative_to(root.resolve()):
-        raise InputError(f"{place}: would be in {folder}, outside {root}; make the link on the way a relative one")
+        raise InputError(
+            f"{place}: would be in {folder}, outside {root}; replace the link on its path by a relative one"
+        )
     return place
 
 
@@ -163,7 +165,7 @@ def _change(root: Path, file: PlannedFile) -> Change:
     if place.is_symlink() and os.path.normpath(file.path.parent / place.readlink()) == os.devnull:
         return Change.MASKED
     if not (place.is_symlink() or place.is_file()):
-        raise InputError(f"{place}: expected a file; move away what is there")
+        raise InputError(f"{place}: expected a file; move the existing one away")
     if file.target is not None:
         return Change.SAME if place.is_symlink() and place.readlink() == file.target else Change.CHANGED
     return Change.SAME if not place.is_symlink() and place.read_bytes() == file.content else Change.CHANGED
@@ -175,7 +177,7 @@ def _refuse_masked(root: Path, report: InstallReport) -> None:
             elsewhere = [] if root == Path("/") else [f"--root={root}"]
             unit = path == UNIT
             mend = ["systemctl", *elsewhere, "unmask", SERVICE] if unit else ["rm", str(below(root, path))]
-            raise InputError(f"{path}: is masked by a link to {os.devnull}; to have it again: {shlex.join(mend)}")
+            raise InputError(f"{path}: is masked by a link to {os.devnull}; unmask it: {shlex.join(mend)}")
 
 
 def _write(root: Path, file: PlannedFile, report: InstallReport) -> None:

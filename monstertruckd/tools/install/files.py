@@ -135,7 +135,9 @@ def temporary(program: Program) -> str | None:
     """Why the service could not run ``program``, or None."""
     hidden = (place for place in program.reads if any(place.is_relative_to(folder) for folder in HIDDEN))
     place = next(hidden, None)
-    return None if place is None else f"{place}: temporary, a service has its own /tmp; install to /opt/monstertruckd"
+    return (
+        None if place is None else (f"{place}: temporary folder, invisible to a service; install to /opt/monstertruckd")
+    )
 
 
 def _at_home(program: Program) -> list[Path]:

@@ -96,7 +96,7 @@ def plan(config_file: Path | None, user: str | None, program: Program, root: Pat
         raise InputError(hidden)
     source = config_file or installed_config(root) or below(root, CONFIG)
     if config_file is None and not source.is_file():
-        raise NotFoundError(f"{source}: no configuration is installed; name the robot's with --config FILE")
+        raise NotFoundError(f"{source}: no configuration is installed; pass the robot's with --config FILE")
     config, tree = load_truck(source)
     if "sim" in tree.data:
         raise ConfigError(f"{source}: sim: is a simulated robot; a service drives a real one")
@@ -180,10 +180,13 @@ def _save_name(saved: Path, saves: Path) -> str:
 
 def _notes(config: TruckConfig) -> list[str]:
     notes = [
-        f"devices.{role}.port: {device.port.path} is made by no rule; name hub and port: monstertruckd find-port {role}"
+        f"devices.{role}.port: {device.port.path} is not created by any udev rule; set hub and port: "
+        f"monstertruckd find-port {role}"
         for role, device in config.devices.present().items()
         if isinstance(device.port, PortConfig) and device.port.path.is_relative_to(LINKS)
     ]
     if config.usb.power.method is CycleMethod.UHUBCTL:
-        notes.append("usb.power.method: uhubctl needs the raw hubs, which the service may not open; use port")
+        notes.append(
+            "usb.power.method: uhubctl needs raw access to the hubs, which the service does not have; use port"
+        )
     return notes

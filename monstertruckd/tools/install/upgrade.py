@@ -36,9 +36,11 @@ def upgrade(plan: InstallPlan, root: Path, *, dry: bool = False, run: Run = run_
         NotPermittedError: see ``install``.
     """
     if not runs_here(root):
-        raise InputError(f"{root}: no systemd runs there that could try the new version; install without --upgrade")
+        raise InputError(
+            f"{root}: systemd does not run there, so the new version cannot be tested; install without --upgrade"
+        )
     if not place_of(root, UNIT).is_file():
-        raise NotFoundError(f"{UNIT}: no service is installed; begin with install-service --config FILE --start")
+        raise NotFoundError(f"{UNIT}: no service is installed; start with install-service --config FILE --start")
     report = install(plan, root, dry=True, run=run)
     _refuse_armed(run)
     if not dry:
@@ -108,10 +110,10 @@ def _put_back(before: list[_Before], run: Run) -> None:
 def _go_back(before: list[_Before], run: Run) -> str:
     """Run the version before again; returns how that went."""
     if not before:
-        return "there is no version to go back to: the one before was in the same folder"
+        return "no version to return to: the previous one was in the same folder"
     try:
         _put_back(before, run)
         run(RESTART)
     except TruckError as error:
         return f"the previous version does not run either: {error}"
-    return "the version before runs again"
+    return "the previous version runs again"

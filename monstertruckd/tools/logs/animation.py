@@ -125,10 +125,10 @@ def animate(
     frames_per_second = 12.5  # a GIF counts hundredths of a second
     scenes = _scenes(reader, round(speed / frames_per_second * SECOND), report)
     if not scenes:
-        raise InputError(f"{reader.path}: no pose in it: nothing to draw")
+        raise InputError(f"{reader.path}: contains no poses to draw")
     if len(scenes) > MOST_FRAMES:
         needed = speed * len(scenes) / MOST_FRAMES
-        raise InputError(f"{len(scenes)} pictures, at most {MOST_FRAMES}: expected --speed {math.ceil(needed)} or more")
+        raise InputError(f"{len(scenes)} frames, at most {MOST_FRAMES}: expected --speed {math.ceil(needed)} or more")
     canvas = _AnimationCanvas(scenes, width, recorded_geometry(reader.path, reader.config()))
     rest = 1.5  # display time of the last picture, s
     try:

@@ -52,7 +52,7 @@ def scans_of(path: Path, make: str, content: BagContent, given: dict[str, Any], 
     """
     topic = _scan_topic(path, content, topics)
     found = content.scans[topic]
-    with reading(f"{path}: {topic}", "times that rise"):
+    with reading(f"{path}: {topic}", "increasing times"):
         clock, stamps = steady_clock(*(_times([scan.times for scan in found], clock) for clock in range(2)))
     frame = found[0].frame
     frames = _Frames.of(content.transforms, clock)
@@ -95,7 +95,7 @@ def _scan_topic(path: Path, content: BagContent, topics: tuple[str, ...]) -> str
     """
     for topic in topics:
         if topic in content.others:
-            raise InputError(f"{path}: {topic} holds {content.others[topic]}: expected {SCANS}, or odometry")
+            raise InputError(f"{path}: {topic} contains {content.others[topic]}: expected {SCANS}, or odometry")
         if topic not in content.scans and topic not in content.odometry:
             raise InputError(f"{path}: no topic {topic}: it has {', '.join(content.topics) or 'none'}")
     found = [topic for topic in topics if topic in content.scans] or list(content.scans)
@@ -104,7 +104,7 @@ def _scan_topic(path: Path, content: BagContent, topics: tuple[str, ...]) -> str
         raise InputError(f"{path}: no scans: expected a topic of {SCANS}; it has {held or 'no other topics'}")
     if len(found) > 1:
         counts = ", ".join(f"{topic} ({len(content.scans[topic])})" for topic in found)
-        raise InputError(f"{path}: several topics of scans: {counts}: name one by --topic")
+        raise InputError(f"{path}: several topics of scans: {counts}: choose one with --topic")
     return found[0]
 
 

@@ -63,7 +63,7 @@ def read_carmen(path: Path, given: dict[str, Any], topics: tuple[str, ...] = ())
     if not lines:
         return ScanLog("carmen", [])
     clocks = _clocks(lines)
-    with reading(path, "times that rise"):
+    with reading(path, "increasing times"):
         number, stamps = steady_clock(*(np.round((times - times[0]) * SECOND).astype(np.int64) for times in clocks))
     mount = _mount(lines)
     brought = dict(lines[0].geometry) | ({} if mount is None else {"mount": mount})

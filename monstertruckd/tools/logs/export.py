@@ -141,7 +141,7 @@ def made_folder(directory: str | Path) -> Path:
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{directory}: cannot be made: {error.strerror}") from None
+        raise InputError(f"{directory}: cannot be created: {error.strerror}") from None
     return directory
 
 
@@ -256,7 +256,7 @@ def export_mcap(
         if not topics:
             file.unlink()
     except FileExistsError:
-        raise InputError(f"{file}: is there already") from None
+        raise InputError(f"{file}: already exists") from None
     except OSError as error:
         raise InputError(f"{file}: cannot be written: {error.strerror}") from error
     return topics

@@ -81,7 +81,7 @@ def export_lerobot(
         InputError: not a log, no odometry or commands, topics selected, or the folder cannot be written.
     """
     if selection.topics:
-        raise InputError("a data set takes the topics that it needs: leave the option --topic out")
+        raise InputError("a data set needs fixed topics: omit the option --topic")
     reader = open_log(path)
     there = info(reader.path)["topics"]
     for topic in (t.ODOMETRY.name, t.CMD_DRIVE.name):
@@ -99,7 +99,7 @@ def export_lerobot(
                 directory.rmdir()
                 return {}
     except FileExistsError:
-        raise InputError(f"{directory}: is there already") from None
+        raise InputError(f"{directory}: already exists") from None
     except OSError as error:
         raise InputError(f"{directory}: cannot be written: {error.strerror}") from error
     return dict.fromkeys(topics, directory)

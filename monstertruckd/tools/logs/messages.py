@@ -65,7 +65,7 @@ class Selection:
     def nothing(self) -> str:
         """Remark about a log without a selected message."""
         every = not self.topics and self.start == 0.0 and self.end == math.inf
-        return "no message of a topic of this version" if every else "no message of these topics and times"
+        return "no message of a topic known to this version" if every else "no message of these topics and times"
 
     def of(self, reader: LogReader, progress: Progress | None = None) -> Iterator[tuple[LogMessage, Message]]:
         """The selected messages with their decoded forms; other schemas are skipped.

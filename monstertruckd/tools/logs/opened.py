@@ -237,7 +237,7 @@ class OpenedLog:
 
     def _warn(self) -> None:
         if self._reader.fault is not None:
-            warnings.warn(f"{self._reader.path}: {self._reader.fault}; what is whole was read", stacklevel=3)
+            warnings.warn(f"{self._reader.path}: {self._reader.fault}; only the intact part was read", stacklevel=3)
 
 
 def named(topic: str) -> str:

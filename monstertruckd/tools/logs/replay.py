@@ -48,7 +48,7 @@ def replay_log(
     reader = open_log(log)
     start = next((message.log_time for message in reader), None)
     if start is None:
-        raise InputError(f"{reader.path}: holds no messages" + (f"; {reader.damage}" if reader.damage else ""))
+        raise InputError(f"{reader.path}: contains no messages" + (f"; {reader.damage}" if reader.damage else ""))
 
     async def main(clock: ReplayClock) -> int:
         bus = Bus(clock)

@@ -345,7 +345,9 @@ def show(recording: Path) -> None:
         CommandFailedError: there is no display, or the viewer failed.
     """
     if sys.platform == "linux" and not any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"))):
-        raise CommandFailedError("the rerun viewer needs a display, and there is none; --save writes a file instead")
+        raise CommandFailedError(
+            "the rerun viewer needs a display, but none is available; --save writes a file instead"
+        )
     with tempfile.TemporaryDirectory(prefix="monstertruckd-view-") as folder:
         confined = environment(Path(folder))
         _run_viewer(["analytics", "disable"], confined, quiet=True)

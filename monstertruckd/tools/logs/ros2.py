@@ -67,7 +67,7 @@ def export_ros2(
         if not topics:
             shutil.rmtree(directory)
     except WriterError as error:
-        raise InputError(f"{directory}: no bag can be made there: {error}") from error
+        raise InputError(f"{directory}: the bag cannot be created: {error}") from error
     except OSError as error:
         raise InputError(f"{directory}: cannot be written: {error.strerror}") from error
     return topics

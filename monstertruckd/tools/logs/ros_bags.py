@@ -27,7 +27,7 @@ def _bounded(decompressor: Any) -> Callable[[bytes], bytes]:
         found: bytes = unpacking.decompress(data, MOST_UNPACKED + 1)
         if not unpacking.eof:
             text = f"more than {MOST_UNPACKED // MEGABYTE} MB" if len(found) > MOST_UNPACKED else "cut off"
-            raise ValueError(f"a packed chunk is {text}")
+            raise ValueError(f"a compressed chunk is {text}")
         return found
 
     return unpack
@@ -92,7 +92,7 @@ def _require_stored(database: Path) -> None:
             raise sqlite3.DatabaseError(str(fault).removeprefix("*** in database main ***").strip())
         repeated = bag.execute("SELECT id FROM topics GROUP BY id HAVING count(*) > 1").fetchone()
         if repeated is not None:
-            raise InputError(f"{database}: several topics have the id {repeated[0]}: expected an id for each")
+            raise InputError(f"{database}: several topics have the id {repeated[0]}: expected unique ids")
 
 
 def _mcap_parts(folder: Path) -> list[Path] | None:
@@ -104,7 +104,9 @@ def _mcap_parts(folder: Path) -> list[Path] | None:
     about = read_yaml(folder / METADATA)["rosbag2_bagfile_information"]
     packed = str(about.get("compression_mode") or "none").lower()
     if packed != "none":
-        raise InputError(f"{folder}: packed by {packed} (compression_mode): unpack it first, by `ros2 bag convert`")
+        raise InputError(
+            f"{folder}: compressed with {packed} (compression_mode): decompress it first with `ros2 bag convert`"
+        )
     if about["storage_identifier"] != "mcap":
         return None
     return [folder / Path(name).name for name in about["relative_file_paths"]]

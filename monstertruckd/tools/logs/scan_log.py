@@ -117,7 +117,7 @@ def steady_clock(*clocks: NDArray[np.int64]) -> tuple[int, NDArray[np.int64]]:
     times = clocks[number]
     starts = np.flatnonzero(np.diff(times, prepend=times[0] - 1))
     if len(starts) < 2:
-        raise ValueError(f"all {len(times)} scans have one time")
+        raise ValueError(f"all {len(times)} scans have the same time")
     last = times[starts[-1]] + (times[starts[-1]] - times[0]) * (len(times) - starts[-1]) // starts[-1]
     return number, np.interp(
         np.arange(len(times)), [*starts, len(times)], [*(times[starts] - times[0]), last - times[0]]

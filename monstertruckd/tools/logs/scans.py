@@ -41,10 +41,10 @@ OWN_FIELD: Final = b"codes"
 """Name of a field that only our scans have."""
 STRANGERS: Final = {
     b"version https://git-lfs": "a git-LFS pointer, not the file itself: fetch it with `git lfs pull`",
-    b"\x1f\x8b": "packed by gzip: unpack it first (CARMEN and URG text may stay packed as NAME.gz)",
-    b"BZh": "packed by bzip2: unpack it first",
-    b"\xfd7zXZ": "packed by xz: unpack it first",
-    b"\x28\xb5\x2f\xfd": "packed by zstd: unpack it first",
+    b"\x1f\x8b": "compressed with gzip: decompress it first (CARMEN and URG text may stay compressed as NAME.gz)",
+    b"BZh": "compressed with bzip2: decompress it first",
+    b"\xfd7zXZ": "compressed with xz: decompress it first",
+    b"\x28\xb5\x2f\xfd": "compressed with zstd: decompress it first",
     b"7z\xbc\xaf": "a 7z archive: unpack it first",
 }
 """Formats that are refused by name, by their first bytes."""
@@ -84,7 +84,7 @@ def _checked(path: Path, log: ScanLog, given: dict[str, Any], topics: tuple[str,
     if not log.scans:
         raise InputError(f"{path}: no scans: expected {EXPECTED}")
     if given and log.make in ("mcap", "urg"):
-        raise InputError(f"{path}: {next(iter(given))}: a log of this format ({log.make}) brings its geometry")
+        raise InputError(f"{path}: {next(iter(given))}: a log of this format ({log.make}) contains its geometry")
     if topics and not log.sources:
         raise InputError(f"{path}: {topics[0]}: a log of this format ({log.make}) has no topics to choose")
     return log
@@ -145,7 +145,7 @@ def _own(reader: LogReader) -> Iterator[ScanInput]:
 
 def _arrays(path: Path, given: dict[str, Any]) -> ScanLog:
     """An npz log; its geometry is ``given``, else its arrays of the same names, else assumed."""
-    arrays = arrays_of(path, "arrays t, ranges and perhaps odom")
+    arrays = arrays_of(path, "arrays t, ranges and optionally odom")
     ranges = _array(path, arrays, "ranges", (-1, -1))
     times = _array(path, arrays, "t", (len(ranges),))
     odom = _array(path, arrays, "odom", (len(ranges), 3)) if "odom" in arrays else None

@@ -94,4 +94,4 @@ def write_trajectory(
         return said
     second = path.with_name(f"{path.stem}.lost{path.suffix}")
     replace_file(second, "".join(tum(*row) for row in itertools.compress(rows, lost.tolist())))
-    return f"{said}; {np.count_nonzero(lost)} lost ones, listed in {second}"
+    return f"{said}; {np.count_nonzero(lost)} lost poses, listed in {second}"

@@ -44,7 +44,7 @@ def write_driver(kind: DriverKind, name: str, parent: Path) -> Path:
         raise InputError(f"{name}: a device kind or role has this name; expected another, such as acme_{name}")
     folder = parent / name
     if folder.exists():
-        raise InputError(f"{folder}: exists; expected a new name, or --folder with another place")
+        raise InputError(f"{folder}: exists; choose another name, or another place with --folder")
     try:
         parent.mkdir(parents=True, exist_ok=True)
         scratch = Path(tempfile.mkdtemp(prefix=f".{name}-", dir=parent))

@@ -199,4 +199,4 @@ def check_complete(answers: dict[str, Any]) -> None:
     """
     required = [name for name, field in Answers.model_fields.items() if field.is_required()]
     if missing := [f"--{name.replace('_', '-')}" for name in required if name not in answers]:
-        raise InputError(f"missing {', '.join(missing)}; on a terminal, new-robot asks")
+        raise InputError(f"missing {', '.join(missing)}; on a terminal, new-robot asks for them")

@@ -34,7 +34,7 @@ def write_robot(answers: Answers, parent: Path, tree: TreeSnapshot) -> Path:
     """
     folder = parent / answers.name
     if folder.exists():
-        raise InputError(f"{folder}: exists; expected a new name, or --folder with another place")
+        raise InputError(f"{folder}: exists; choose another name, or another place with --folder")
     try:
         parent.mkdir(parents=True, exist_ok=True)
         scratch = Path(tempfile.mkdtemp(prefix=f".{answers.name}-", dir=parent))
@@ -58,9 +58,9 @@ def texts(answers: Answers, folder: Path, tree: TreeSnapshot) -> dict[str, str]:
     """The files by name."""
     own = compose.robot(answers, tree, _named_from(folder, shipped(NAVIGATION)))
     heads = {
-        ROBOT: "The robot. Every value left out has the default that `monstertruckd config show` prints.",
-        SIMULATION: "What makes it a simulation: emulated ports, a world, and the robot as it is built.",
-        TWIN: "The simulated twin: the robot, and the one include that makes it a simulation.",
+        ROBOT: "The robot. Omitted values have the defaults that `monstertruckd config show` prints.",
+        SIMULATION: "The simulation: emulated ports, a world, and the true dimensions of the robot.",
+        TWIN: "The simulated twin: includes the robot and the simulation.",
     }
     sections = {ROBOT: own, SIMULATION: compose.simulated(answers), TWIN: compose.twin(ROBOT, SIMULATION)}
     return {name: f"# {head}\n{yaml_text(sections[name])}" for name, head in heads.items()}

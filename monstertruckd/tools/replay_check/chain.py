@@ -75,10 +75,10 @@ def replayable(config: TruckConfig) -> TruckConfig:
     """
     slam = config.slam
     if slam is not None and slam.mode == "ros2":
-        raise InputError("slam.mode ros2: where the robot was came from outside, and is not computed again")
+        raise InputError("slam.mode ros2: the pose came from outside and cannot be recomputed")
     if slam is not None:
         if slam.mode == "localisation" and (slam.map is None or not slam.map.is_dir()):
-            raise NotFoundError(f"slam.map: {slam.map}: no such folder; the log does not hold it")
+            raise NotFoundError(f"slam.map: {slam.map}: no such folder, and the log does not contain it")
         slam = slam.model_copy(update={"save": None})
     return config.model_copy(
         update={
@@ -120,11 +120,11 @@ def why_no_goals(own: TruckConfig, used: TruckConfig, log: GoalRecord) -> str | 
     if own.own_planner is None or used.own_planner is None:
         return None if own.own_planner is used.own_planner else "only one of the two configurations has a planner"
     if not log.reports:
-        return "the log holds no report on goals"
+        return "the log contains no state of goals"
     if used.slam is None and used.own_planner.map is not None and not used.own_planner.map.is_file():
-        return f"planner.map: {used.own_planner.map}: no such file, and the log does not hold it"
+        return f"planner.map: {used.own_planner.map}: no such file, and the log does not contain it"
     if log.unknown_waypoints(period_of(own.own_planner)):
-        return "waypoints came by remote call, which no log holds"
+        return "waypoints came by remote call, which logs do not contain"
     return None
 
 

@@ -177,9 +177,9 @@ def _inexact(*configs: TruckConfig) -> tuple[frozenset[str], frozenset[str]]:
 def _refuse_the_middle(log: Path, found: Survey, compared: Collection[str]) -> None:
     outputs = [entry for name, entry in found.first.items() if name in compared and name != topics.SCAN.name]
     if not outputs:
-        raise InputError(f"{log}: holds no outputs of estimation to compare with")
+        raise InputError(f"{log}: contains no outputs of estimation to compare")
     for entry in outputs:
         number = entry.decode().seq
         if number > 0:
-            text = f"{entry.topic} begins with number {number}: expected the first part of a run, which begins with 0"
+            text = f"{entry.topic} starts with number {number}: expected the first part of a run, which starts with 0"
             raise InputError(f"{log}: {text}")

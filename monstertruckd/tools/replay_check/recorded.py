@@ -39,7 +39,7 @@ def parts_of(log: Path) -> list[Path]:
     parts = {int(name[2]): path for path, name in run if name and name[1] == named[1]}
     if 0 not in parts:
         first = log.with_name(f"run-{named[1]}-000.mcap")
-        raise InputError(f"{log}: {first.name} is not there: expected the first part of the run, which begins with 0")
+        raise InputError(f"{log}: {first.name} is missing: expected the first part of the run, which starts with 0")
     return [parts[number] for number in sorted(parts)]
 
 
@@ -60,7 +60,7 @@ def run_of(log: Path) -> tuple[Path, int | None]:
     places = (Path(named), *(folder / Path(named).name for folder in log.absolute().parents[:2]))
     found = next((place for place in places if place.is_file()), None)
     if found is None:
-        raise InputError(f"{log}: begins in the middle of its run, and the run's log {named} is not there")
+        raise InputError(f"{log}: starts in the middle of its run, and the run's log {named} is missing")
     return found, max((message.log_time for message in reader), default=0)
 
 
@@ -111,7 +111,7 @@ class RunLog:
         for number, reader in enumerate(self._readers):
             self._reader, self._before = reader, sum(done.size for done in self._readers[:number])
             if (missing := self._missing_before(number)) is not None:
-                self.damage = f"{missing} is not there: the run is known up to it alone"
+                self.damage = f"{missing} is missing: the run is known only up to it"
                 return
             for entry in reader.before_damage():
                 if self._until is not None and entry.log_time > self._until:
@@ -121,7 +121,7 @@ class RunLog:
                     yield entry
             if reader.damage is not None:
                 where = "" if len(self._readers) == 1 else f"{reader.path.name} "
-                self.damage = f"{where}{reader.damage}; `monstertruckd log recover` keeps what is sound"
+                self.damage = f"{where}{reader.damage}; `monstertruckd log recover` keeps the intact part"
                 return
 
     def _missing_before(self, number: int) -> str | None:
@@ -189,9 +189,9 @@ def survey(log: RunLog) -> Survey:
         found.goals.note(entry)
     why = f" ({log.damage})" if log.damage else ""
     if found is None:
-        raise InputError(f"{log.path}: holds no messages{why}")
+        raise InputError(f"{log.path}: contains no messages{why}")
     if not any(name.startswith("sensor/") for name in found.counts):
-        raise InputError(f"{log.path}: holds no messages of sensors, so nothing can be computed again{why}")
+        raise InputError(f"{log.path}: contains no sensor messages to recompute from{why}")
     found.damage = log.damage
     return found
 

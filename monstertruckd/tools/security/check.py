@@ -80,7 +80,7 @@ class _Attempt:
         try:
             (await in_thread(lambda: socket.create_connection(place, ABSENCE_TIMEOUT))).close()
         except OSError as error:
-            raise NotFoundError(f"nothing listens at {self._endpoint}: {error}") from None
+            raise NotFoundError(f"no server at {self._endpoint}: {error}") from None
 
     async def cases(self) -> AsyncIterator[Case]:
         """Run all cases in turn."""
@@ -91,10 +91,10 @@ class _Attempt:
         yield await self._case(f"{pilot}, a pilot", "state, calls and orders", pilot, self._may_all)
         if observers:
             yield await self._case(f"{observers[0]}, an observer", "state, no orders", observers[0], self._may_see)
-        yield await self._case(f"{pilot} under another name", "nothing arrives", pilot, self._not_as_another)
+        yield await self._case(f"{pilot} under another name", "no request arrives", pilot, self._not_as_another)
         authority, now = self._folder.authority(), self._now()
         stranger = issue(authority, "stranger", now, LONG_LIFE)
-        yield await self._refused("a stranger of this authority", stranger, "no link, or nothing to see")
+        yield await self._refused("a stranger of this authority", stranger, "no link, or an empty view")
         rogue = issue(new_authority(authority.certificate.subject.rfc4514_string()[3:], now, 1), pilot, now, LONG_LIFE)
         yield await self._refused(f"{pilot} of another authority", rogue, "no link")
         yield await self._refused("no certificate", None, "no link")
@@ -126,7 +126,7 @@ class _Attempt:
         except NotFoundError:
             return Case(who, expected, "no link", met=True)
         met = not seen and expected != "no link"
-        return Case(who, expected, "sees the robot" if seen else "the link opens, nothing to see", met=met)
+        return Case(who, expected, "sees the robot" if seen else "the link opens, no data visible", met=met)
 
     async def _plain(self) -> Case:
         plain = self._endpoint.replace("tls/", "tcp/", 1)
@@ -137,7 +137,7 @@ class _Attempt:
             return Case("without TLS", "no link", "no link", met=True)
 
     async def _expiring(self, name: str) -> Case:
-        who, expected = "a certificate that expires", "state until then, nothing afterwards"
+        who, expected = "a certificate that expires", "state until then, no data afterwards"
         short = 6  # lifetime of the certificate in the expiry case, s
         tls = self._files(self._made(name, short), self._folder.issuer(name).pem)
         try:
@@ -172,8 +172,8 @@ class _Attempt:
 
     async def _sees(self, client: TruckClient) -> str:
         if not await client.alive():
-            return "the robot's liveliness is not seen"
-        return "" if await client.get_retained(GATE) is not None else "the state of the gate is not seen"
+            return "the robot's liveliness token is not visible"
+        return "" if await client.get_retained(GATE) is not None else "the gate state is not visible"
 
     # Certificates and links
 

@@ -97,7 +97,9 @@ class CertificateRegister(Schema):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if self.router is not None and self.router.name in self.stations:
-            raise ValueError(f"{self.router.name}: is the fleet's router: expected another name for a station")
+            raise ValueError(
+                f"{self.router.name}: is the name of the fleet's router: choose another name for the station"
+            )
         return self
 
     def of_role(self, *roles: AccessRole) -> tuple[str, ...]:
@@ -136,7 +138,7 @@ class Folder:
         """
         file = self.path / "register.yaml"
         if not file.is_file():
-            raise NotFoundError(f"{self.path}: no authority here; monstertruckd security init makes one")
+            raise NotFoundError(f"{self.path}: contains no authority; create one with monstertruckd security init")
         return _validated(CertificateRegister, read_yaml(file), file)
 
     def init(
@@ -202,7 +204,9 @@ class Folder:
             NotFoundError: there is no authority here.
         """
         if not OWNER_NAME.fullmatch(name):
-            raise InputError(f"{name!r}: expected a name of up to 32 letters, digits and . _ - @; first no . or @")
+            raise InputError(
+                f"{name!r}: expected a name of up to 32 letters, digits and . _ - @, not starting with . or @"
+            )
         with self._alone():
             before = self.register()
             known = before.stations.get(name, CertifiedStation(role=AccessRole.PILOT))
@@ -403,11 +407,12 @@ def _require_time(authority: Certificate, now: int, days: int) -> None:
     early = began(authority.certificate) - now
     if early > 0:
         raise InputError(
-            f"the authority begins in {early / DAY:.1f} days: this computer's clock is wrong, or was when it was made"
+            f"the authority becomes valid in {early / DAY:.1f} days: this computer's clock is wrong, or "
+            "was when it was created"
         )
     left = seconds_left(authority.certificate, now) // DAY
     if days > left:
-        raise InputError(f"{days} days: the authority expires in {left}; a new one takes another folder")
+        raise InputError(f"{days} days: the authority expires in {left}; create a new one in another folder")
 
 
 def _validated(model: type[S], data: Any, where: Path | str) -> S:

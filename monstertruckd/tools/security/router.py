@@ -51,7 +51,7 @@ def make_router(
     registers = [folder.register() for folder in robots]
     names = [ROUTER, *(register.robot for register in registers), *{n for each in registers for n in each.stations}]
     if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise InputError(f"{', '.join(twice)}: expected another name for each robot and station behind one router")
+        raise InputError(f"{', '.join(twice)}: expected a different name for each robot and station behind one router")
     target = path / "router"
     make_folder(target, 0o700)
     files = path / "authority.pem", path / "authority.key"

@@ -55,7 +55,7 @@ def load_simulated(path: Path) -> SimulatedTruckConfig:
     """
     tree = load_tree(path)
     if tree.data.get("sim") is None:
-        raise ConfigError(f"{path}: describes a real robot: it has no section `sim`, as the bundled `full` has")
+        raise ConfigError(f"{path}: describes a real robot: add a section `sim`, as in the bundled `full`")
     return validated(tree, path, SimulatedTruckConfig)[0]
 
 

@@ -36,7 +36,7 @@ def claimed(*links: Path) -> Iterator[None]:
                 link.parent.mkdir(parents=True, exist_ok=True)
             stack.enter_context(reserved(*links))
         except PermissionError as error:
-            raise NotPermittedError(f"{error.filename}: this user may not make a port there") from error
+            raise NotPermittedError(f"{error.filename}: this user may not create a port there") from error
         except OSError as error:
             if error.errno is None:
                 raise NotPermittedError(str(error)) from None
@@ -56,10 +56,10 @@ async def emulate_device(device: str, link: Path | tuple[str, int], clock: Clock
     """
     kind = DEVICES.named(device)
     if kind.opens == "computer":
-        raise InputError(f"{device}: the computer's own files, no device on a port; simulate emulates them")
+        raise InputError(f"{device}: consists of files of the computer, not a device on a port; `simulate` emulates it")
     if isinstance(link, tuple):
         if kind.opens != "serial":
-            raise InputError(f"{device}: no device on a network socket")
+            raise InputError(f"{device}: is not a device on a network socket")
         with closing(SocketPort(*link)) as socket:
             async with _served(kind, device, socket, clock, seed) as emulated:
                 yield emulated

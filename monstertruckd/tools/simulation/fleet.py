@@ -28,10 +28,10 @@ def as_fleet(configs: Sequence[SimulatedTruckConfig]) -> list[SimulatedTruckConf
             value, expected = getattr(config.sim.world, name), getattr(first.sim.world, name)
             if value != expected:
                 raise InputError(
-                    f"{config.robot}: sim.world.{name} is {value}: expected that of {first.robot}, {expected}"
+                    f"{config.robot}: sim.world.{name} is {value}: expected the value of {first.robot}, {expected}"
                 )
         if config.sim.world.people not in ((), first.sim.world.people):
-            raise InputError(f"{config.robot}: sim.world.people: expected none, or those of {first.robot}")
+            raise InputError(f"{config.robot}: sim.world.people: expected none, or the same as {first.robot}")
     _require_apart(configs, "robot", lambda config: [config.robot])
     _require_apart(configs, "devices: port", _ports)
     _require_apart(configs, "zenoh.listen", lambda config: config.zenoh.listen)
@@ -67,4 +67,6 @@ def _require_apart(
     for i, config in enumerate(configs):
         for claim in claims(config):
             if (owner := owners.setdefault(claim, i)) != i:
-                raise InputError(f"{what} {claim}: of {configs[owner].robot} and of {config.robot}: expected one each")
+                raise InputError(
+                    f"{what} {claim}: used by {configs[owner].robot} and {config.robot}: expected one each"
+                )

@@ -42,8 +42,8 @@ from monstertruckd.tools.simulation.tape import EmulatedTape
 Say = Callable[[str], None]
 Beside = Callable[[Commanded], Coroutine[Any, Any, None]]
 ANOTHER: Final = (
-    "probably another `simulate` on this computer; Ctrl-C in its terminal ends it. "
-    "A second robot beside it needs a configuration with a `robot` and `zenoh: listen` of its own"
+    "probably another `simulate` on this computer; end it with Ctrl-C in its terminal. A second robot "
+    "needs a configuration with another `robot` and `zenoh: listen`"
 )
 """Advice for ports that are in use."""
 
@@ -90,7 +90,7 @@ class EmulatedRoom:
 
     def _put(self, now: int, post: Disc) -> None:
         if len(self._posts) >= MOST_POSTS:
-            raise InputError(f"{MOST_POSTS} posts are in the room; remove them first")
+            raise InputError(f"{MOST_POSTS} posts are already in the room; remove them first")
         robot = self._world.truth(now)
         if penetration(Box(robot.x, robot.y, *self._body, robot.yaw), post) > 0:
             raise InputError(f"post at {post.x:.2f}, {post.y:.2f} m: the robot is there")
@@ -181,7 +181,7 @@ def _linked(config: SimulatedTruckConfig, folder: Path) -> Iterator[None]:
         return
     link = config.machine
     if link.exists() and not link.is_symlink():
-        raise InputError(f"machine: {link} exists: expected a free name for the link to the emulated computer")
+        raise InputError(f"machine: {link} exists: choose a free name for the link to the emulated computer")
     with claimed(link):
         link.unlink(missing_ok=True)
         link.symlink_to(folder, target_is_directory=True)

@@ -11,8 +11,8 @@ from monstertruck_sim.world.plant import TruthState
 from monstertruck_sim.world.world import World
 
 WORDS: Final = (
-    "tape mark (a mark on the floor below the front bumper, and a string along the robot), "
-    "tape (measure from there, and the volts of the pack)"
+    "tape mark (mark the floor below the front bumper and lay a string along the robot), tape (measure "
+    "from there, and read the pack voltage)"
 )
 
 

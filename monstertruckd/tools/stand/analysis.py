@@ -51,7 +51,7 @@ def errors_of(log: LogReader) -> list[EstimateError]:
     seen = _array(series[STAND_POSE.name])
     if len(seen) < LEAST_COMMON:
         raise InputError(
-            f"{log.path}: {len(seen)} poses of a stand in it: expected {LEAST_COMMON}, as with `stand: overhead`"
+            f"{log.path}: contains {len(seen)} poses of a stand: expected {LEAST_COMMON}, as with `stand: overhead`"
         )
     found = [
         error_of(topic.name, seen, rows)
@@ -59,7 +59,7 @@ def errors_of(log: LogReader) -> list[EstimateError]:
         if len(rows := _array(series[topic.name])) >= LEAST_COMMON
     ]
     if not found:
-        raise InputError(f"{log.path}: no odometry in it")
+        raise InputError(f"{log.path}: contains no odometry")
     return found
 
 
@@ -78,7 +78,7 @@ def error_of(what: str, seen: Array, estimate: Array) -> EstimateError:
     at = seen[:, 0] - (latency or 0.0)
     inside = (at >= estimate[0, 0]) & (at <= estimate[-1, 0])
     if inside.sum() < LEAST_COMMON:
-        raise InputError(f"{what}: {int(inside.sum())} poses at times that the stand saw: expected {LEAST_COMMON}")
+        raise InputError(f"{what}: {int(inside.sum())} poses at times covered by the stand: expected {LEAST_COMMON}")
     truth, there = seen[inside, 1:], interpolate(estimate[:, 0], estimate[:, 1:], at[inside])
     aligned = _laid_over(truth, there, slice(None))
     off = np.hypot(*(aligned[:, :2] - truth[:, :2]).T)

@@ -83,7 +83,7 @@ def place(lens: Lens, seen: Mapping[int, Array], marks: Mapping[int, MarkConfig]
     """
     known = sorted(seen.keys() & marks.keys())
     if len(known) < LEAST_MARKS:
-        raise InputError(f"marks {known or 'none'} are in sight: expected {LEAST_MARKS} of {sorted(marks)}")
+        raise InputError(f"the camera sees marks {known or 'none'}: expected {LEAST_MARKS} of {sorted(marks)}")
     points = np.array([(marks[tag].x, marks[tag].y, 0.0) for tag in known])
     pixels = np.array([seen[tag] for tag in known])
     _, rotation, translation = cv2.solvePnP(points, pixels, lens.matrix, lens.distortion, flags=cv2.SOLVEPNP_IPPE)
@@ -123,9 +123,11 @@ def check_places(
         without = {tag: off(place(placed.lens, {t: px for t, px in seen.items() if t != tag}, marks)) for tag in seen}
         least, tag = min((max(way for t, way in rest.items() if t != tag), tag) for tag, rest in without.items())
         if least < limit:
-            raise InputError(f"a mark is not where it should be, {text({tag: without[tag][tag]})}: measure it again")
+            raise InputError(
+                f"a mark is not at its configured place, {text({tag: without[tag][tag]})}: measure it again"
+            )
     worst = dict(sorted(now.items(), key=lambda item: -item[1])[:3])
-    raise InputError(f"marks are not where they should be, {text(worst)}: measure them all again")
+    raise InputError(f"marks are not at their configured places, {text(worst)}: measure them all again")
 
 
 def join(

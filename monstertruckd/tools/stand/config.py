@@ -82,7 +82,7 @@ class BlobRobot(MarkedRobot):
     @model_validator(mode="after")
     def _two_colours(self) -> Self:
         if self.front == self.rear:
-            raise ValueError(f"front and rear are {self.front}: expected two colours, which say where its front is")
+            raise ValueError(f"front and rear are both {self.front}: expected two colours, to distinguish the ends")
         return self
 
     @property
@@ -134,9 +134,9 @@ class OverheadConfig(Schema):
             raise ValueError(f"{', '.join(both)}: expected in robots or in blobs, not in both")
         tags = [robot.tag for robot in self.robots.values()]
         if twice := sorted({tag for tag in tags if tags.count(tag) > 1 or tag in self.marks}):
-            raise ValueError(f"tag {twice[0]}: expected on one robot, and not among the marks")
+            raise ValueError(f"tag {twice[0]}: expected on one robot only, and not among the marks")
         for name, robot in self.blobs.items():
             alike = [other for other, its in self.blobs.items() if other != name and its.colours == robot.colours]
             if alike and robot.start is None:
-                raise ValueError(f"blobs.{name} has the colours of {alike[0]}: expected `start`, where it stands first")
+                raise ValueError(f"blobs.{name} has the same colours as {alike[0]}: set `start`, its initial position")
         return self

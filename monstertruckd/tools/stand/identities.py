@@ -106,8 +106,8 @@ class Identities:
         if not new:
             return []
         return [
-            f"robots {', '.join(new)} look alike and were out of sight together: put them to their starts, one after "
-            "the other"
+            f"robots {', '.join(new)} look alike and were out of sight together: place them at their "
+            "starts one at a time"
         ]
 
     def _cost(self, name: str, stamp: int, pair: Pair) -> float | None:

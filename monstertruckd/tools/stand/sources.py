@@ -40,7 +40,7 @@ def pictures_in(folder: Path) -> list[Picture]:
 def _files(folder: Path) -> list[Path]:
     files = sorted(path for path in folder.glob("*") if path.suffix.lower() in ENDINGS) if folder.is_dir() else []
     if not files:
-        raise InputError(f"{folder}: no pictures in it ({', '.join(ENDINGS)}): take some with `stand snap`")
+        raise InputError(f"{folder}: contains no images ({', '.join(ENDINGS)}): take some with `stand snap`")
     return files
 
 
@@ -59,7 +59,7 @@ def stream(
                 yield _read(path, colour=colour)
             return
         capture = cv2.VideoCapture(str(source.path))
-        yield from _frames(source.path, capture, InputError("cannot be read as a film"), colour=colour)
+        yield from _frames(source.path, capture, InputError("cannot be read as a video"), colour=colour)
         return
     if isinstance(source, RenderedCamera):
         yield from _rendered(source.port, Mode(*size, rate), colour=colour)
@@ -73,7 +73,7 @@ def stream(
     ):
         capture.set(what, value)
     yield from _frames(source.device, capture, DeviceLostError("cannot be opened"), colour=colour)
-    raise DeviceLostError(f"{source.device}: sends no more pictures")
+    raise DeviceLostError(f"{source.device}: stopped sending images")
 
 
 def _rendered(port: Path, mode: Mode, *, colour: bool) -> Iterator[Picture]:

@@ -180,7 +180,7 @@ class StandTracker:
             lost = now - state.heard > silent * SECOND
             if lost != state.lost:
                 said.append(
-                    f"camera {name} " + (f"sends no picture for {silent:g} s" if lost else "sends pictures again")
+                    f"camera {name} " + (f"has sent no image for {silent:g} s" if lost else "sends images again")
                 )
                 state.lost = lost
             if lost:
@@ -192,11 +192,11 @@ class StandTracker:
             moved = bool(self.marks) and (blind or state.distance > 0.005)
             if moved and not state.moved:
                 what = (
-                    f"sees none of its marks for {BLIND:g} s"
+                    f"has seen none of its marks for {BLIND:g} s"
                     if blind
                     else f"has moved: its marks are {1000 * state.distance:.0f} mm from their places"
                 )
-                said.append(f"camera {name} {what}: it is left out, calibrate the stand again")
+                said.append(f"camera {name} {what}: it is ignored; calibrate the stand again")
             elif state.moved and not moved:
                 said.append(f"camera {name} sees its marks in their places again")
             state.moved = moved

@@ -231,7 +231,7 @@ class _Gone:
 
 
 def _banner(state: ScreenState) -> Text:
-    said = "no robot" if state.began is None else "no word of the robot"
+    said = "no robot" if state.began is None else "no data from the robot"
     text = f"{said} for {state.silence:.0f} s" + (f": {state.trouble}" if state.trouble else "")
     return Text(text, style="bold white on red")
 
@@ -313,7 +313,7 @@ def _tilt(table: Table, state: ScreenState) -> None:
         roll, pitch = (math.degrees(angle) for angle in (state.attitude.roll, state.attitude.pitch))
         _row(table, "tilt", f"roll {roll:+.1f}° pitch {pitch:+.1f}°", state.old("attitude"))
     if state.scan is not None and state.scan.tilt is not None:
-        _row(table, "lidar", f"{math.degrees(state.scan.tilt):.1f}° off the level", state.old("scan"))
+        _row(table, "lidar", f"{math.degrees(state.scan.tilt):.1f}° from level", state.old("scan"))
 
 
 def _done(tracker: TrackerState) -> float:

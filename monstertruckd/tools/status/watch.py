@@ -97,7 +97,7 @@ async def print_once(clock: Clock, robot: str, endpoint: str, *, json_output: bo
         await clock.sleep(1.2)
         newest: dict[str, Message] = {name: box.latest for name, box in boxes.items() if box.latest is not None}
         if not newest:
-            raise NoAnswerError(f"robot {robot!r} at {endpoint} published nothing for a second")
+            raise NoAnswerError(f"robot {robot!r} at {endpoint} published no message within a second")
         if json_output:
             rows = {name: m.model_dump(mode="json") for name, m in newest.items() if name not in PICTURED}
             print(json.dumps(rows, indent=2))

@@ -66,9 +66,9 @@ def read_runs(log: Path | LogReader) -> tuple[list[Run], dict[str, Any]]:
         elif isinstance(message, StandPose):
             seen.append((message.stamp, message.pose.x, message.pose.y, message.pose.yaw))
     if not asked:
-        raise InputError(f"{path}: no client drove by shaft speeds in it (`study circle`, `study straight`)")
+        raise InputError(f"{path}: no client drove by shaft speeds (`study circle`, `study straight`)")
     if not seen:
-        raise InputError(f"{path}: no poses of a test stand in it: expected `stand: simulator` or `overhead`")
+        raise InputError(f"{path}: contains no poses of a test stand: expected `stand: simulator` or `overhead`")
     return [_run(part, np.array(seen)) for part in _parts(asked)], reader.config()
 
 

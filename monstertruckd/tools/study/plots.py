@@ -37,7 +37,7 @@ def _centre(axes: Any, run: Run, found: Circle) -> None:
         (drawn,) = axes.plot(run.times[smoothed // 2 :][: smooth.size], smooth, linewidth=0.5, alpha=0.6)
         label = f"{name}, {run.name}: {1000 * drift:.3f} mm/s"
         axes.plot(run.times, 1000 * drift * at, color=drawn.get_color(), label=label)
-    axes.set(xlabel="time, s", ylabel="centre of rotation less its begin, mm")
+    axes.set(xlabel="time, s", ylabel="centre of rotation relative to its start, mm")
 
 
 def _places(axes: Any, run: Run, _found: Any) -> None:
@@ -61,7 +61,7 @@ FIGURES: Final[tuple[tuple[int, str, float | None, Draw], ...]] = (
     (12, "Track, one side locked", np.inf, _track),
     (13, "Velocity, one side locked", np.inf, _velocity),
     (14, "X and Y on the line", None, _places),
-    (15, "Tracks of the passes to and fro", None, _passes),
+    (15, "Tracks of the passes there and back", None, _passes),
 )
 """Number, title, ratio of its circles (None for the line), and drawing of each run."""
 

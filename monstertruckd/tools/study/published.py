@@ -48,10 +48,11 @@ _ROWS: Final = (
 CIRCLES: Final = tuple(PublishedCircle(circle, *row) for circle, row in zip(PUBLISHED_CIRCLES, _ROWS, strict=True))
 
 SLIPS: Final = (
-    "The conclusion prints the drifts of the centres ten times larger (0.91 cm/s for 0.091).",
+    "The paper's conclusion prints the drifts of the centres ten times too large (0.91 cm/s for 0.091).",
     "Figure 7 is captioned 2:1 and shows 3:1.",
     "The line's theoretical speed is printed as 3.24 cm/s; 2.1 cm x 1.57 rad/s are 3.30.",
-    "All measured speeds lie above the ideal ones, which slip could only lower: the effective wheel radius is larger.",
+    "All measured speeds exceed the ideal ones, although slip can only reduce them: the effective wheel "
+    "radius is larger.",
 )
 
 

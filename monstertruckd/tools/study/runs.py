@@ -94,7 +94,7 @@ def shaft_rates(config: TruckConfig, stretch: Stretch) -> tuple[float, ...]:
         InputError: it has no left and right side.
     """
     if config.body.kind not in ("skid_steer", "differential"):
-        raise InputError(f"body {config.body.kind}: expected one with a left and a right side, as skid_steer")
+        raise InputError(f"body {config.body.kind}: expected one with a left and a right side, such as skid_steer")
     return (stretch.left, stretch.right) * (len(config.chassis().shafts) // 2)
 
 
@@ -130,7 +130,7 @@ async def drive(robot: Operator, clock: Clock, config: TruckConfig, plan: Sequen
                     if state is not None and state is not seen:
                         seen, heard = state, clock.now()
                     if not seen.mode.active and seen.stamp > armed.stamp:
-                        raise RequestRefusedError(seen.worst, f"the robot stopped on the way: {seen.why}")
+                        raise RequestRefusedError(seen.worst, f"the robot stopped during the run: {seen.why}")
                     if clock.now() - heard > GONE * SECOND:
                         raise NoAnswerError(f"the robot has been silent for {GONE:g} s")
         except BaseException:

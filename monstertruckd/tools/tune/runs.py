@@ -42,7 +42,7 @@ class TuningRun(NamedTuple):
         """Result in one line."""
         gains, (overshoot, steady) = self.gains, self.verdict
         stayed = math.isfinite(overshoot)
-        found = f"{100 * overshoot:.0f} % beyond, steady {1000 * steady:.1f} mm" if stayed else "left the wall"
+        found = f"{100 * overshoot:.0f} % overshoot, steady error {1000 * steady:.1f} mm" if stayed else "left the wall"
         return f"K_p {gains.k_p:.3g}, K_d {gains.k_d:.3g}: {found}"
 
 
@@ -153,7 +153,7 @@ async def _followed(states: Mailbox[BehaviourState], number: int, over: Callable
         if not state.running:
             raise RequestRefusedError(state.outcome, f"the run ended early: {state.text or state.outcome.text}")
         if state.elapsed > limit:
-            text = f"{state.phase} for {limit:g} s: place the robot beside a straight wall"
+            text = f"{state.phase} for {limit:g} s: place the robot alongside a straight wall"
             raise RequestRefusedError(Reason.TIMEOUT, text)
         if state.phase != FOLLOWING or "distance" not in state.values:
             samples = []

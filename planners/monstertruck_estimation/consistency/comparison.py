@@ -106,8 +106,9 @@ class Disagreement(NamedTuple):
         unit, word = ("m", "moved") if self.quantity is Quantity.WAY else ("rad", "turned")
         form = ".2f" if self.quantity is Quantity.WAY else "+.2f"
         return (
-            f"by the {self.one} the robot {word} {self.by_one:{form}} {unit}, by the {self.other} "
-            f"{self.by_other:{form}} {unit}: {self.difference:.2f} {unit} apart, {self.limit:.2f} {unit} tolerated"
+            f"{self.one}: the robot {word} {self.by_one:{form}} {unit}; {self.other}: "
+            f"{self.by_other:{form}} {unit}; difference {self.difference:.2f} {unit}, limit "
+            f"{self.limit:.2f} {unit}"
         )
 
 

@@ -376,8 +376,8 @@ class ConsistencyMonitor:
     def _take_delay(self, stamp: int, delay: Delay) -> None:
         lidar, (first, *_) = self._sensors[Measure.SCANS], self._witnesses
         text = (
-            f"motion seen in the scans lags {delay.seconds:.1f} s behind the {' and the '.join(self._witnesses)}: "
-            f"{self._config.delay:g} s tolerated"
+            f"motion in the scans lags {delay.seconds:.1f} s behind the "
+            f"{' and the '.join(self._witnesses)}: limit {self._config.delay:g} s"
         )
         self._found.setdefault(
             lidar,
@@ -400,8 +400,9 @@ class ConsistencyMonitor:
         self._scaled = None
         if abs(self._scale - 1.0) > tolerated:
             text = (
-                f"its ranges became {self._scale:.2f} times as long from one revolution to the next; measure one, then "
-                f"switch the lidar off for more than {IN_USE / SECOND:g} s to accept them"
+                f"its ranges became {self._scale:.2f} times as long from one revolution to the next; "
+                f"check one with a tape, then switch the lidar off for more than {IN_USE / SECOND:g} s to "
+                "accept them"
             )
             self._scaled = Doubt(
                 sensor=self._sensors[Measure.SCANS],
@@ -432,7 +433,7 @@ class ConsistencyMonitor:
     def _note_frozen(self, sensor: str, field: str, stamp: int, row: int, *, frozen: bool) -> None:
         known = self._frozen.get(sensor)
         if frozen and known is None:
-            text = f"its {field} repeats to the digit: {row} times in a row"
+            text = f"its {field} is identical {row} times in a row"
             self._frozen[sensor] = Doubt(
                 sensor=sensor, kind=DoubtKind.REPEATS, since=stamp, text=text, difference=float(row), limit=1.0
             )

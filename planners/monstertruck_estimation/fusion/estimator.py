@@ -195,12 +195,12 @@ class Fusion:
         roll = self._wheels.observe_drive(*shafts)
         if roll is None:
             if self._wheels.stamp == stamp and known:
-                self._left_out["drive: not later, or no number"] += 1
+                self._left_out["drive: stamp does not increase, or not a finite number"] += 1
             elif self._wheels.known:
                 self._begin(self._wheels.stamp)
             return
         if roll.lost:
-            self._left_out["drive: counts from a new origin"] += 1
+            self._left_out["drive: position counter restarted"] += 1
             return
         measured = self._felt(roll, self._wheel_measurement(roll, self._chassis))
         self._apply_slip(self._slip.wheels(measured))
@@ -215,7 +215,7 @@ class Fusion:
         """Take heading and tilt."""
         values = (attitude.heading, attitude.roll, attitude.pitch)
         if not all(map(math.isfinite, values)):
-            self._left_out["compass: no number"] += 1
+            self._left_out["compass: not a finite number"] += 1
             return
         if not self._later("compass", attitude.stamp):
             return
@@ -258,11 +258,11 @@ class Fusion:
         x, y, yaw = np.abs(measured.delta).tolist()
         margin = (0.1, 0.1)  # allowance for errors of two scans in the limits of their motion, m and rad
         if max(x, y) > self._config.max_speed * dt + margin[0] or yaw > self._config.max_turn * dt + margin[1]:
-            self._left_out["lidar: faster than the robot can be"] += 1
+            self._left_out["lidar: motion faster than the robot's maximum"] += 1
             return
         self._apply_slip(self._slip.scans(measured))
         if self._slip.doubted:
-            self._left_out["lidar: against the wheels when it has just been blind"] += 1
+            self._left_out["lidar: contradicts the wheels right after a gap"] += 1
             return
         history = self._begin(measured.since)
         if history.scan_before(measured.stamp) != measured.since:
@@ -297,8 +297,8 @@ class Fusion:
         if contrary is not None:
             return contrary.text
         if self._jump:
-            return f"its headings jumped by {self._jump:+.2f} rad, and the robot did not turn"
-        return "its headings or its field are off"
+            return f"its headings jumped by {self._jump:+.2f} rad although the robot did not turn"
+        return "its headings or its field strength are wrong"
 
     @property
     def state(self) -> FilterState | None:
@@ -377,7 +377,7 @@ class Fusion:
 
     def _later(self, sensor: str, stamp: int) -> bool:
         if stamp <= self._last.get(sensor, -1):
-            self._left_out[f"{sensor}: not later than the one before"] += 1
+            self._left_out[f"{sensor}: stamp does not increase"] += 1
             return False
         self._last[sensor] = stamp
         return True

@@ -77,7 +77,7 @@ class SlipDetector:
         if not self.slipping or measured.stamp - self._compared_at < expires:
             return None
         self.slipping = False
-        text = f"nothing to compare the wheels with for {expires // SECOND} s: they count again"
+        text = f"no other motion measurement for {expires // SECOND} s: the wheels are used again"
         return SlipChange(slipping=False, since=measured.stamp, text=text)
 
     def scans(self, measured: ScanMeasurement) -> SlipChange | None:

@@ -119,7 +119,7 @@ class GroundService:
         try:
             self._grid = await self._offload(lambda: GroundGrid.load(folder))
         except InputError as error:
-            self._events(Reason.FILE_DAMAGED, Severity.WARNING, self.name, f"{error}; the ground counts as unknown")
+            self._events(Reason.FILE_DAMAGED, Severity.WARNING, self.name, f"{error}; the ground is treated as unknown")
         self._changed = not self._grid.empty
 
     def _observe(self, now: int) -> None:

@@ -61,7 +61,7 @@ def _read(file: Path) -> list[PointOfInterest]:
     names = [point.name for point in points]
     for point in points:
         if names.count(point.name) > 1:
-            raise InputError(f"{file}: {point.name}: expected every name once")
+            raise InputError(f"{file}: {point.name}: expected unique names")
         if max(map(abs, (point.x, point.y, point.z, point.yaw))) > MAX_COORDINATE:
             raise InputError(f"{file}: {point.name}: expected at most {MAX_COORDINATE:g} m and rad")
         least, most = 1e-12, 1e12  # variance of any direction, m^2 or rad^2

@@ -193,7 +193,7 @@ class PointService:
 
     def _take(self, answer: ReadAnswer, placed: _Placed) -> None:
         if answer.unreadable and not self._unreadable:
-            self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, "a picture of the camera cannot be decoded")
+            self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, "an image of the camera cannot be decoded")
         self._unreadable = answer.unreadable
         for reading in answer.readings:
             found = self._map.see(reading, placed.stamp, placed.pose, placed.covariance, placed.rate)
@@ -315,7 +315,9 @@ class PointService:
         try:
             self._map.load(await self._offload(lambda: files.load(folder)))
         except InputError as error:
-            self._events(Reason.FILE_DAMAGED, Severity.WARNING, self.name, f"{error}; points are not saved over it")
+            self._events(
+                Reason.FILE_DAMAGED, Severity.WARNING, self.name, f"{error}; points are not saved over this file"
+            )
             if folder == self._folders.save:
                 self._folders = PointFolders(folder)
         self._dirty = dict.fromkeys(self._map.points)
@@ -347,7 +349,7 @@ class PointService:
         reason = await self._save()
         self._unsaved = reason is not Reason.OK
         if self._unsaved:
-            text = f"done, but a power cut would undo it: {reason.text}; the robot goes on trying to save it"
+            text = f"done, but a power cut would undo it: {reason.text}; the robot keeps trying to save it"
             raise RequestRefusedError(reason, text)
         await self._require_map()
 
@@ -366,7 +368,7 @@ class PointService:
                 while not await self._offload(lambda: holds_map(folder, run)):
                     await self._clock.sleep(0.1)
         except TimeoutError:
-            text = "done, but a power cut would undo it: the map is not saved yet; the robot goes on trying"
+            text = "done, but a power cut would undo it: the map is not saved yet; the robot keeps trying"
             raise RequestRefusedError(Reason.NO_MAP, text) from None
         self._map_saved = True
 
@@ -402,15 +404,15 @@ class PointService:
         if (request.x is None) != (request.y is None):
             raise InputError("point: x and y: expected both, or neither")
         if request.name.startswith("tag-"):
-            raise InputError(f"point {request.name!r}: names that begin with tag- are those of tags")
+            raise InputError(f"point {request.name!r}: names starting with tag- are reserved for tags")
         if request.name not in self._map.points and len(self._map.points) >= self._config.most:
-            raise InputError(f"point: {self._config.most} are known: no room for more")
+            raise InputError(f"point: the maximum of {self._config.most} points is reached; remove one first")
         self._gather()
         fresh = self._history and self._clock.now() - self._history[-1].stamp <= POSE.fresh_for() * SECOND
         if not fresh:
             raise RequestRefusedError(Reason.NO_MAP, "no fresh pose in map")
         if request.x is None and self._is_lost():
-            raise RequestRefusedError(Reason.POSE_LOST, "where the robot is in the map is not known")
+            raise RequestRefusedError(Reason.POSE_LOST, "the robot's pose in the map is unknown")
         here = self._history[-1]
         x, y, yaw = here.pose
         place = (
@@ -435,7 +437,7 @@ class PointService:
         """
         tracked = self._map.points.get(name)
         if tracked is None or not tracked.picture:
-            raise NotFoundError(f"no picture of a point of interest {name!r}")
+            raise NotFoundError(f"no image of a point of interest {name!r}")
         return tracked.picture
 
     def register(self, rpc: RpcRegistry) -> None:

@@ -64,7 +64,7 @@ def submap_of(saved: SavedMap) -> Submap:
         return Submap(Cloud.of(merged(saved.graph.scans, saved.graph.poses)))
     surfaces = surface_elements(saved.grid)
     if not len(surfaces):
-        raise InputError("the map has no occupied cells next to free ones: nothing to localise in")
+        raise InputError("the map has no occupied cells next to free ones, so localisation is impossible")
     return Submap(Cloud.of(surfaces))
 
 

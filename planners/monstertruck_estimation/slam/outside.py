@@ -148,7 +148,7 @@ class OutsideLocalisation:
     def _report(self, now: int) -> None:
         if self._status is LocalisationStatus.LOCALISED and now >= self._until:
             self._status = LocalisationStatus.LOST
-            text = f"{self._source} sends no correction any more: the pose is odometry"
+            text = f"{self._source} stopped sending corrections: the pose follows odometry"
             self._events(Reason.POSE_LOST, Severity.WARNING, self.name, text)
         if now < self._due:
             return

@@ -33,7 +33,7 @@ def unpacked(request: MapRequest) -> Cells:
     try:
         cells = np.frombuffer(reader.decompress(request.packed, count + 1), np.int8)
     except zlib.error as error:
-        raise RequestRefusedError(Reason.BAD_INPUT, f"map: packed: {error}") from None
+        raise RequestRefusedError(Reason.BAD_INPUT, f"map: compressed data: {error}") from None
     if len(cells) != count:
         more = "more than" if len(cells) > count else f"{len(cells)} of"
         raise RequestRefusedError(Reason.BAD_INPUT, f"map: {more} {count} cells")

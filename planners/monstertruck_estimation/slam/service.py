@@ -44,7 +44,7 @@ UNMATCHED: Final = SECOND
 CORRECTIONS: Final = {
     "closed": (Reason.LOOP_CLOSED, Severity.INFO, "closure {}"),
     "joined": (Reason.LOOP_CLOSED, Severity.INFO, "two submaps are joined"),
-    "parted": (Reason.JOIN_UNDONE, Severity.WARNING, "what was seen since then contradicts it"),
+    "parted": (Reason.JOIN_UNDONE, Severity.WARNING, "later scans contradict it"),
 }
 """Event text of a step that has corrected the map; {} is the number of closures."""
 
@@ -421,9 +421,9 @@ class SlamService:
             text = f"along {estimate.direction:.2f} rad in map"
             self._events(Reason.MATCH_DEGENERATE, Severity.WARNING, self.name, text)
         if estimate.status is LocalisationStatus.OUTSIDE:
-            self._events(Reason.OUTSIDE_MAP, Severity.WARNING, self.name, "the search goes on")
+            self._events(Reason.OUTSIDE_MAP, Severity.WARNING, self.name, "the search continues")
         elif estimate.status not in MATCHED:
-            text = "the place found was wrong: searching" if "refuted" in estimate.events else str(estimate.status)
+            text = "the pose found was wrong: searching again" if "refuted" in estimate.events else str(estimate.status)
             self._events(Reason.POSE_LOST, Severity.WARNING, self.name, text)
         elif before is not None and before not in MATCHED:
             self._events(Reason.POSE_FOUND, Severity.INFO, self.name, str(estimate.status))

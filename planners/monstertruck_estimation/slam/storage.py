@@ -131,7 +131,7 @@ def save(folder: Path, patch: GridPatch, graph: SavedGraph | None, run: str = ""
         OSError: a file could not be written.
     """
     if not patch.cells.size:
-        raise InputError(f"{folder}: nothing is mapped yet")
+        raise InputError(f"{folder}: the map is still empty")
     text, picture = map_content(trinary(patch), PICTURE)
     parts = {YAML: text.encode(), PICTURE: picture}
     if graph is not None and graph.scans:
@@ -193,7 +193,7 @@ def _graph_of(path: Path, arrays: dict[str, NDArray[Any]]) -> SavedGraph:
     starts, count = arrays["starts"].astype(np.int64), len(arrays["poses"])
     whole = len(starts) == count + 1 and starts[0] == 0 and (np.diff(starts) >= 0).all()
     if not whole or starts[-1] != len(arrays["points"]) or len(arrays["stamps"]) != count:
-        raise InputError(f"{path}: starts: expected {count + 1} rising numbers from 0 to {len(arrays['points'])}")
+        raise InputError(f"{path}: starts: expected {count + 1} increasing numbers from 0 to {len(arrays['points'])}")
     every = {name: arrays[name].astype(np.float64) for name in ELEMENTS if name in arrays}
     edges = {name: values for name, values in arrays.items() if name in EDGES}
     for group in (every, edges):

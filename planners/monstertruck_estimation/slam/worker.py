@@ -47,7 +47,7 @@ class SlamWorker:
             return WorkerOutput(unreadable=str(problem))
         estimator = self._estimator
         if estimator is None:
-            raise InputError("estimation: expected a start before anything else")
+            raise InputError("estimation: expected a start message first")
         made, left_out, refused = None, None, None
         if inputs.scan is not None:
             left_out, refused = self._refusal(inputs.scan)

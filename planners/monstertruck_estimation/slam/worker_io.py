@@ -154,7 +154,7 @@ class ScanLeftOut(StrEnum):
     """Reason why a scan was not used."""
 
     GEOMETRY = "another geometry"
-    ORDER = "not later than the scan before"
+    ORDER = "stamp not later than the previous scan's"
     EMPTY = "too few returns"
 
 

@@ -87,7 +87,7 @@ def fit_lens(views: Sequence[BoardSighting], reader: BoardReader, size: tuple[in
         InputError: too few of them, or none of them tilted.
     """
     if len(views) < LEAST_BOARDS:
-        raise InputError(f"the board is seen in {len(views)} pictures: expected {LEAST_BOARDS}")
+        raise InputError(f"the board is visible in {len(views)} images: expected {LEAST_BOARDS}")
     objects = [reader.points[view.ids].astype(np.float32) for view in views]
     images = [view.corners.astype(np.float32) for view in views]
     try:
@@ -95,7 +95,7 @@ def fit_lens(views: Sequence[BoardSighting], reader: BoardReader, size: tuple[in
             objects, images, size, np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3
         )
     except cv2.error as error:
-        raise InputError(f"the pictures of the board determine no lens: {error.err}: hold it tilted") from error
+        raise InputError(f"the images of the board do not determine the lens: {error.err}: hold it tilted") from error
     count = sum(len(view.ids) for view in views)
     lens = Lens(np.asarray(matrix), np.ravel(distortion)[:5], size)
     poses = zip(views, turns, places, strict=True)
@@ -139,7 +139,7 @@ def lens_from_pictures(pictures: Sequence[Picture], reader: BoardReader) -> tupl
     """A lens from pictures of a board, and how many of them showed it; raises as ``fit_lens``."""
     views = [view for picture in pictures if (view := reader.read(picture)) is not None]
     if len(views) < LEAST_BOARDS:
-        raise InputError(f"the board is seen in {len(views)} of {len(pictures)} pictures: expected {LEAST_BOARDS}")
+        raise InputError(f"the board is visible in {len(views)} of {len(pictures)} images: expected {LEAST_BOARDS}")
     height, width = pictures[0].shape
     return fit_lens(views, reader, (width, height)), len(views)
 

@@ -90,7 +90,7 @@ class LeaderFollower:
         config, me, peers = self._config, inputs.of(POSE).pose, inputs.of(PEERS)
         leader = next((peer for peer in peers.peers if peer.robot == config.leader), None)
         if leader is None:
-            return BehaviourStep(None, state, "listen", Reason.INPUT_STALE, f"{config.leader} was not heard yet")
+            return BehaviourStep(None, state, "listen", Reason.INPUT_STALE, f"no pose of {config.leader} received yet")
         silent = (peers.stamp - leader.heard) / SECOND
         if silent > config.silence:
             text = f"{config.leader} has been silent for {silent:.2f} s"

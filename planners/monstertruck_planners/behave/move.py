@@ -85,7 +85,7 @@ class MoveConfig(BehaviourConfig):
         if (self.length is None) is (self.angle is None):
             raise ValueError("expected either a length or an angle")
         if 0.0 in (self.length, self.angle):
-            raise ValueError("the length or angle is 0: nothing would move")
+            raise ValueError("the length or angle is 0: the robot would not move")
         try:
             if self.angle is None:
                 assert self.length is not None
@@ -188,7 +188,7 @@ class Move:
             # 0.3: time for which the gate must command the move's direction, because servos respond late, s
             if since is None or t - since < 0.3:
                 if t > 4.0:  # seconds
-                    return self._ended(state, Reason.NOT_OBEYED, "the wheels do not reach the move's angles")
+                    return self._ended(state, Reason.NOT_OBEYED, "the wheels cannot reach the move's steering angles")
                 # 0.02: speed while the wheels steer, as a fraction of the move's speed: above the standstill threshold
                 return self._going(state, math.copysign(0.02 * self._amounts.speed, self._distance))
             state = replace(

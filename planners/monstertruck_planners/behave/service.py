@@ -204,7 +204,7 @@ class BehaviourService:
         tracker = self._tracker.latest
         following = tracker is not None and now - tracker.received <= TRACKER.fresh_for() * SECOND
         if following and tracker is not None and tracker.outcome is Reason.DRIVING:
-            return f"the path {tracker.path!r} is followed"
+            return f"the tracker follows the path {tracker.path!r}"
         return None
 
     # Steps
@@ -223,7 +223,7 @@ class BehaviourService:
         run = replace(run, state=step.state, phase=step.phase, values=step.values, dock=step.dock)
         motion = step.motion or RequestedMotion()
         if not all(map(math.isfinite, motion)):
-            self._end(run, Reason.NOT_FINITE, f"{run.name} asked for {motion}", now)
+            self._end(run, Reason.NOT_FINITE, f"{run.name} requested {motion}", now)
         elif step.outcome is not Reason.DRIVING:
             self._end(run, step.outcome, step.text, now)
         else:
@@ -252,9 +252,9 @@ class BehaviourService:
         for topic in behaviour.reads:
             message = self._read[topic.name].latest
             if message is None:
-                return f"nothing came on {topic.name}"
+                return f"no message received on {topic.name}"
             if (age := (now - message.received) / SECOND) > topic.fresh_for():
-                return f"nothing came on {topic.name} for {age:.2f} s"
+                return f"no message received on {topic.name} for {age:.2f} s"
         return None
 
     def _judged(self, run: BehaviourRun, motion: RequestedMotion, now: int) -> BehaviourRun:
@@ -349,7 +349,7 @@ def _with_settings(config: BehaviourConfig, settings: Mapping[str, Any]) -> Beha
     if not settings:
         return config
     if unknown := settings.keys() - type(config).model_fields.keys() | settings.keys() & {"kind", "rate"}:
-        raise InputError(f"settings.{min(unknown)}: no setting of a run of {config.kind}")
+        raise InputError(f"settings.{min(unknown)}: not a setting of {config.kind} for one run")
     try:
         return type(config).model_validate({**config.model_dump(), **settings})
     except ValidationError as error:

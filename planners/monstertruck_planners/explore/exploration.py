@@ -240,7 +240,7 @@ def begin(
     """Start an exploration."""
     none = Attempts(config.blacklist, config.attempts)
     run = Exploration(number, source, pose, home, budget, now, now, none, none, find, since=now)
-    text = f"{config.kind}, for {budget:g} s at most{', then home' if home else ''}, asked for by {source}"
+    text = f"{config.kind}, for {budget:g} s at most{', then home' if home else ''}, requested by {source}"
     return run, (Notice(Reason.EXPLORATION_STARTED, Severity.INFO, text),)
 
 
@@ -260,7 +260,7 @@ def tick(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
     if run.phase is ExplorationPhase.SAVING:
         return _saving(run, seen)
     if seen.displaced:
-        return _end(run, Reason.CANCELLED, f"the goal of {seen.displaced} is pursued now", Save())
+        return _end(run, Reason.CANCELLED, f"the goal of {seen.displaced} took over", Save())
     if (why := _stopped(seen)) is not None:
         return _end(run, *why, Cancel(), Save())
     if seen.paused:
@@ -269,7 +269,7 @@ def tick(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
         return _lost(run, seen, config)
     if seen.pose is None:
         lost = replace(_enter(run, ExplorationPhase.LOST), target=None, backing=False, looks=0, goes_back=False)
-        return lost, (Cancel(), Notice(Reason.POSE_LOST, Severity.WARNING, "waits where it stands"))
+        return lost, (Cancel(), Notice(Reason.POSE_LOST, Severity.WARNING, "the robot waits at its position"))
     if run.phase is ExplorationPhase.RETURNING:
         return _returning(run, seen)
     if (why := _enough(run, seen, config)) is not None:
@@ -282,7 +282,7 @@ def _stopped(seen: Observed) -> tuple[Reason, str] | None:
     if seen.estopped:
         return Reason.ESTOPPED, Reason.ESTOPPED.text
     if seen.critical:
-        return Reason.BATTERY_CRITICAL, "it stands where it is"
+        return Reason.BATTERY_CRITICAL, "the robot stays at its position"
     return (Reason.SERVICE_FAILED, seen.failed) if seen.failed else None
 
 
@@ -333,7 +333,9 @@ def _enough(run: Exploration, seen: Observed, config: ExplorerConfig) -> tuple[R
     needed = config.reserve * home * charge_per_metre(run, seen.charge, config)
     if seen.charge > needed:
         return None
-    return Reason.CHARGE_SPENT, f"{seen.charge:.0%} are left, {needed:.0%} are kept for {home:.1f} m"
+    return Reason.CHARGE_SPENT, (
+        f"battery {seen.charge:.0%}, of which {needed:.0%} are reserved for the {home:.1f} m home"
+    )
 
 
 def charge_per_metre(run: Exploration, charge: float, config: ExplorerConfig) -> float:
@@ -361,7 +363,7 @@ def _looking(run: Exploration, seen: Observed) -> Step:
         return replace(run, nothing=run.nothing + 1, not_before=run.now + MAPPING_TIME), ()
     attempts, unreached = run.attempts.released(run.now), run.unreached.released(run.now)
     if attempts is not None or unreached is not None:
-        text = "nothing else is left: places that were left alone are tried again"
+        text = "only skipped targets are left: they are tried again"
         again = replace(run, attempts=attempts or run.attempts, unreached=unreached or run.unreached)
         again = replace(again, nothing=0, not_before=run.now)
         return again, (Notice(Reason.RECOVERING, Severity.INFO, text),)
@@ -375,7 +377,7 @@ def _driving(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
         if seen.ended in HOPELESS:
             return _finish(replace(run, returns=False), seen.ended, seen.ended_text)
         if seen.ended is Reason.CANCELLED:
-            return _end(run, Reason.CANCELLED, f"its goal was cancelled: {seen.ended_text}", Save())
+            return _end(run, Reason.CANCELLED, f"the goal was cancelled: {seen.ended_text}", Save())
         broken = seen.refused and seen.ended in BROKEN
         if seen.ended in PASSING or broken:
             text = seen.ended_text if broken else seen.ended.text
@@ -395,7 +397,7 @@ def _driving(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
         run = replace(_enter(run, ExplorationPhase.LOOKING), not_before=run.now + MAPPING_TIME, nothing=0)
         if reached:
             return run, ()
-        text = f"not reached ({seen.ended.text}): left alone for {config.blacklist:g} s"
+        text = f"not reached ({seen.ended.text}): skipped for {config.blacklist:g} s"
         return run, (Notice(seen.ended, Severity.INFO, text),)
     answer = seen.answer
     if answer is not None and not answer.kept and not run.backing:
@@ -436,7 +438,7 @@ def _back(run: Exploration) -> Step | None:
     target = Viewpoint(earlier[-1], earlier[-1][:2])
     run = replace(run, attempts=attempts, unreached=unreached, trail=earlier[:-1], stuck=0, failures=run.failures + 1)
     run = replace(_enter(run, ExplorationPhase.DRIVING), target=target, backing=True, pursued=run.now, nothing=0)
-    text = f"{STUCK} places in a row were not reached from here: drives back to where it came from"
+    text = f"{STUCK} targets in a row were not reached from here: the robot drives back the way it came"
     return run, (Go(target.pose), Notice(Reason.RECOVERING, Severity.INFO, text))
 
 
@@ -458,11 +460,11 @@ def _lost(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
         stop = () if run.target is None else (Cancel(),)
         return found, (*stop, Notice(Reason.POSE_FOUND, Severity.INFO, "goes on"))
     if run.now - run.since > config.lost:
-        text = f"its place was not found for {config.lost:g} s; it stands where it is"
+        text = f"its pose was not found for {config.lost:g} s; the robot stays at its position"
         return _finish(replace(run, returns=False), Reason.POSE_LOST, text)
     if run.target is not None:
         if seen.ended is Reason.CANCELLED:
-            return _end(run, Reason.CANCELLED, f"its goal was cancelled: {seen.ended_text}", Save())
+            return _end(run, Reason.CANCELLED, f"the goal was cancelled: {seen.ended_text}", Save())
         if seen.ended is None:
             return run, ()
         back = seen.ended is Reason.GOAL_REACHED and not run.goes_back
@@ -477,7 +479,9 @@ def _lost(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
     around = ((0.6, 0.0, 0.0), (0.6, 0.25, 0.8), (0.6, -0.25, -0.8))
     x, y, yaw = placed(np.array((around[run.looks % len(around)],)), seen.believed)[0].tolist()
     pose = x, y, math.remainder(yaw, math.tau)
-    say = () if run.looks else (Notice(Reason.RECOVERING, Severity.INFO, "its place is not known: looks around"),)
+    say = (
+        () if run.looks else (Notice(Reason.RECOVERING, Severity.INFO, "its pose is unknown: the robot looks around"),)
+    )
     run = replace(run, target=Viewpoint(pose, pose[:2]), looks=run.looks + 1, came_from=seen.believed)
     return run, (Go(pose), *say)
 
@@ -516,7 +520,7 @@ def _returning(run: Exploration, seen: Observed) -> Step:
 
 def _back_home(run: Exploration, pose: Pose2) -> Step:
     away = math.dist(pose[:2], run.home[:2])
-    beside = f"{away:.1f} m from the start, which the map does not show as free"
+    beside = f"{away:.1f} m from the start, which is not free in the map"
     where = "back at the start" if pose == run.home else beside
     return _end(run, run.final, f"{run.final_text}; {where}", Save())
 
@@ -524,7 +528,9 @@ def _back_home(run: Exploration, pose: Pose2) -> Step:
 def _saving(run: Exploration, seen: Observed) -> Step:
     if seen.saved is None and run.now - run.since < 30.0:  # timeout (s) for saving the map
         return run, ()
-    kept = f"map in {seen.saved}" if seen.saved else f"map not saved{seen.save_failure and ': '}{seen.save_failure}"
+    kept = (
+        f"map saved in {seen.saved}" if seen.saved else f"map not saved{seen.save_failure and ': '}{seen.save_failure}"
+    )
     severity = Severity.INFO if run.final.exit_code == 0 else Severity.WARNING
     text = f"{run.final_text}; {kept}"
     ended = replace(_enter(run, ExplorationPhase.IDLE), outcome=run.final, text=text)

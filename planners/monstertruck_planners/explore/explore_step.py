@@ -44,7 +44,7 @@ class ExploringStep:
             self._setup, self._explorer = task.setup, make_explorer(task.setup.config)
             self._looks = WallLooks(task.setup.camera)
         if self._setup is None or self._explorer is None:
-            raise InputError("exploring: expected a setup before anything else")
+            raise InputError("exploring: expected a setup message first")
         if task.zones is not None:
             self._layer = ZoneLayer(in_force(task.zones), self._layer)
         self._take(task, self._setup.zone_margin)

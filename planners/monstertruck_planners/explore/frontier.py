@@ -57,8 +57,8 @@ class FrontierMap:
             InputError: different resolution, or cells not aligned with the previous ones.
         """
         if grid.resolution != self.resolution or grid.origin.yaw != 0.0:
-            text = f"map of cells of {grid.resolution} m, turned by {grid.origin.yaw} rad"
-            raise InputError(f"{text}: expected cells of {self.resolution} m that are not turned")
+            text = f"map with cells of {grid.resolution} m, rotated by {grid.origin.yaw} rad"
+            raise InputError(f"{text}: expected cells of {self.resolution} m without rotation")
         at = np.array((grid.origin.x, grid.origin.y)) / self.resolution
         low = np.round(at).astype(np.int64)
         if np.abs(at - low).max() > 0.01:

@@ -148,10 +148,12 @@ class ExplorerService:
             RequestRefusedError: the pose is unknown, or points of interest are requested and the robot keeps none.
         """
         if request.find is not None and self._in.points is None:
-            raise RequestRefusedError(Reason.NOT_SUPPORTED, "this robot keeps no points of interest: section `points`")
+            raise RequestRefusedError(
+                Reason.NOT_SUPPORTED, "this robot does not record points of interest: add a section `points`"
+            )
         if (pose := self._pose(self._clock.now())) is None:
             raise RequestRefusedError(
-                Reason.NO_MAP, "no pose in a map yet; `monstertruckd status` shows if slam is ready"
+                Reason.NO_MAP, "no pose in a map yet; `monstertruckd status` shows whether slam is ready"
             )
         return pose
 

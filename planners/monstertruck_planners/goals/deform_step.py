@@ -195,7 +195,7 @@ class DeformStep:
             self._set_up(task.setup)
         setup = self._setup
         if setup is None:
-            raise InputError("deforming: expected a setup before anything else")
+            raise InputError("deforming: expected a setup message first")
         if task.grid is not None:
             self._walls = DistanceField.from_grid(task.grid, unknown_blocks=False)
         if task.zones is not None:
@@ -391,7 +391,7 @@ def _walls_of(place: Path) -> DistanceField | None:
     try:
         world = load_map(place)
     except InputError as error:
-        log.warning("%s; routes are deformed by what the lidar sees alone", error)
+        log.warning("%s; routes are deformed using the lidar only", error)
         return None
     return DistanceField(world.cells >= OCCUPIED, world.resolution, (*world.origin, 0.0))
 

@@ -175,7 +175,7 @@ def placeless(slam: SlamHealth | None) -> str:
     """Return why the pose in map is invalid, from the latest slam health; empty if it is valid or without slam."""
     if slam is None or slam.standing not in PLACELESS:
         return ""
-    return f"its place on the saved map is not known ({slam.standing})"
+    return f"its pose on the saved map is unknown ({slam.standing})"
 
 
 def require_place(slam: SlamHealth | None) -> None:
@@ -185,7 +185,7 @@ def require_place(slam: SlamHealth | None) -> None:
         RequestRefusedError: the robot has not found its place on its saved map.
     """
     if why := placeless(slam):
-        hint = "`monstertruckd drive` it a metre or two there, by which it finds itself"
+        hint = "drive it a metre or two there with `monstertruckd drive`, so that it can localise"
         raise RequestRefusedError(Reason.POSE_LOST, f"{why}: {hint}")
 
 

@@ -231,7 +231,7 @@ def tick(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
 def _planned(run: GoalRun, observed: Observations, answer: RouteAnswer, config: PlannerConfig) -> Step:
     if run.planned == "escape":
         if answer.path is None:
-            return _recover(run, answer.reason, f"no way to back out: {answer.text}", config)
+            return _recover(run, answer.reason, f"no path to back out: {answer.text}", config)
         report = Report(Reason.RECOVERING, Severity.INFO, f"goal {run.number}: backs out {answer.length:.2f} m")
         return _set_off(run, GoalPhase.BACKING_OUT), (Follow(answer), report)
     if answer.path is None:
@@ -241,7 +241,7 @@ def _planned(run: GoalRun, observed: Observations, answer: RouteAnswer, config: 
     # 0.01: with a shorter route (m) the truck is already at the goal
     if answer.length < 0.01 and not run.via and observed.pose is not None:
         return _arrived(replace(run, routes=run.routes + 1), observed, config)
-    kind = "the rest of the route before" if answer.kept else "a new route"
+    kind = "the rest of the previous route" if answer.kept else "a new route"
     text = f"goal {run.number}: {kind}, {answer.text or f'{answer.length:.2f} m'}"
     run = replace(_set_off(run, GoalPhase.DRIVING), routes=run.routes + 1, partial=not answer.complete)
     if math.isinf(run.recovery_distance):
@@ -269,11 +269,11 @@ def _drive(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
         run = _progressed(run, observed.left, config)
     run = replace(run, blocked_scans=run.blocked_scans + 1 if observed.blocked or observed.unseen else 0)
     if run.blocked_scans >= config.blocked_scans and (observed.unseen or not backing):
-        reason, text = Reason.PATH_BLOCKED, "the newest scan shows something on the route"
+        reason, text = Reason.PATH_BLOCKED, "the latest scan shows an obstacle on the route"
         if observed.unseen:
             if not run.via and observed.pose is not None and _error(observed.pose, run.goal, config) <= 1.0:
                 return _arrived(replace(run, misses=MISSES), observed, config)
-            reason, text = Reason.UNSEEN_STOP, "the route leads back onto ground that no sensor has seen"
+            reason, text = Reason.UNSEEN_STOP, "the route reverses onto ground that no sensor has seen"
         run = replace(run, blocks=run.blocks + 1, blocked_scans=0)
         if run.blocks > BLOCKS:
             return _recover(run, reason, text, config)
@@ -342,7 +342,7 @@ def _recover(run: GoalRun, reason: Reason, text: str, config: PlannerConfig) -> 
 
 def _plan(run: GoalRun, config: PlannerConfig, *, clear: bool = False, afresh: bool = False) -> Step:
     if run.routes >= config.routes:
-        return _end(run, Reason.STUCK, f"{run.routes} routes did not lead there")
+        return _end(run, Reason.STUCK, f"{run.routes} routes did not reach it")
     return _enter(replace(run, planned="route"), GoalPhase.PLANNING), (Plan(clear=clear, afresh=afresh),)
 
 

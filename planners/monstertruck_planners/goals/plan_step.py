@@ -288,7 +288,7 @@ class PlanningStep:
         if task.setup is not None:
             self._set_up(task.setup)
         if self._setup is None:
-            raise InputError("planning: expected a setup before anything else")
+            raise InputError("planning: expected a setup message first")
         if task.grid is not None:
             self._map, self._layers, self._keepout = StaticMap.of(task.grid, self._map), None, None
         if task.zones is not None:
@@ -365,8 +365,8 @@ class PlanningStep:
                 return answer
         self._route = None
         look = self._look(static_map, task, unseen)
-        remedy = "drive it forward by hand first, or back with the second control"
-        text = f"every way found leads back onto ground that no sensor has seen, at {x:.1f}, {y:.1f}: {remedy}"
+        remedy = "first drive the robot forward by hand, or backward with the second control held"
+        text = f"every route found reverses onto ground that no sensor has seen, at {x:.1f}, {y:.1f}: {remedy}"
         return look or RouteAnswer(Reason.UNSEEN_STOP, text)
 
     def _zones_around(self, pose: Pose2) -> list[Zone]:
@@ -434,7 +434,7 @@ class PlanningStep:
             answer = self._plan_known(static_map, replace(task, goal=(x, y, yaw), via=()))
             self._route = None
             if answer.path is not None and not len(self._met(unseen, answer)):
-                text = f"{answer.length:.2f} m to look at ground that no sensor has seen"
+                text = f"{answer.length:.2f} m, to look at ground that no sensor has seen"
                 return replace(answer, text=text, complete=False)
         return None
 
@@ -514,7 +514,7 @@ class PlanningStep:
             return replace(answer, path=replace(answer.path, clearance=self._clearance(route_map, answer.path)))
         if result.poses is None or self._setup.config.local_planner is None:
             return RouteAnswer(
-                Reason.BAD_INPUT, "this planner's routes are no motions of the robot: set planner.local_planner"
+                Reason.BAD_INPUT, "the robot cannot drive this planner's routes directly: set planner.local_planner"
             )
         path = PosePath(moved(result.poses, -self._vehicle.reference), np.ones(len(result.poses)))
         return RouteAnswer(Reason.OK, "", path, path.length, result.cost, drivable=False)
@@ -594,7 +594,7 @@ class PlanningStep:
         )
         self._route = None
         if found is None:
-            return RouteAnswer(Reason.STUCK, "both ends of the robot are blocked, or ground there was not seen")
+            return RouteAnswer(Reason.STUCK, "both ends of the robot are blocked or face unseen ground")
         steering: tuple[Steering, ...] = (found.steering,) * len(found.poses)
         directions = np.full(len(found.poses), float(found.direction))
         path = PosePath(placed(found.poses, task.pose), directions, steering)

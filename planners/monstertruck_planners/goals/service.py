@@ -216,7 +216,7 @@ class GoalService:
     def _require_outside_zones(self, goal: Pose2, via: tuple[Place, ...]) -> None:
         layer, margin = self._zone_layer(), self._setup.zone_margin
         if (name := layer.keepout(self._setup.footprint, goal, margin)) is not None:
-            raise RequestRefusedError(Reason.KEEPOUT, f"goal: the robot would reach into the keepout zone {name}")
+            raise RequestRefusedError(Reason.KEEPOUT, f"goal: the robot would overlap the keepout zone {name}")
         for number, place in enumerate(via, 1):
             if (name := layer.keepout_at(place[:2])) is not None:
                 text = f"waypoint {number} of {len(via)}: in the keepout zone {name}"
@@ -268,7 +268,7 @@ class GoalService:
         while (state := self.tasks.reported) is None or (state.number == number and _undecided(state)):
             await self.tasks.next_report()
         if state.number != number:
-            raise RequestRefusedError(Reason.CANCELLED, f"another goal of {state.source} took its place")
+            raise RequestRefusedError(Reason.CANCELLED, f"replaced by another goal of {state.source}")
         if state.routes == 0 and state.phase is GoalPhase.IDLE:
             raise RequestRefusedError(state.outcome, state.text)
         return state
@@ -280,7 +280,7 @@ class GoalService:
         run = self._goal
         if run is not None and run.active:
             if self._paths.displaced:
-                self._do(goal_run.displaced(run, "another path is followed now"))
+                self._do(goal_run.displaced(run, "the tracker follows another path"))
                 if self._deformation is not None:
                     self._deformation.end()
             else:

@@ -123,7 +123,7 @@ class LocalPlannerCore:
             state = LocalPlannerState(route=route)
         cut = self.cut(route, obstacles, robot_pose, state)
         if cut is None:
-            return LocalPlan(Reason.PATH_BLOCKED, state, text="no pose of the route in the window is free")
+            return LocalPlan(Reason.PATH_BLOCKED, state, text="no pose of the route within the window is free")
         band, entered = cut
         return CycleStart(robot_pose, band, replace(state, band=band, entered=entered))
 
@@ -248,7 +248,7 @@ class LocalPlannerCore:
     ) -> LocalPlan:
         """Result without a complete path: the free beginning of the last path, or an approach along the route."""
         reason = why if why is Reason.START_BLOCKED else Reason.PATH_BLOCKED
-        text = f"the local search says: {why.text}"
+        text = f"local search: {why.text}"
         after = replace(state, path=None, failed=state.failed + 1)
         if rest is not None:
             length = self.free_length(obstacles, rest)

@@ -67,7 +67,7 @@ class PublishedPlanner:
         before = replace(state, band=self._pruned(state.band, obstacles, robot_pose))
         cut = self._band.cut(ahead_only, obstacles, robot_pose, before)
         if cut is None:
-            return LocalPlan(Reason.PATH_BLOCKED, state, text="no pose of the route in the window is free")
+            return LocalPlan(Reason.PATH_BLOCKED, state, text="no pose of the route within the window is free")
         ahead, entered = cut
         whole = PosePath(np.vstack((robot_pose, ahead.poses)), np.ones(len(ahead.poses) + 1))
         band = relax_band(whole, obstacles, self._band.cover, self._band_parameters)

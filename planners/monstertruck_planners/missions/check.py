@@ -221,10 +221,10 @@ def conditions_of(step: AnyStep) -> Iterator[tuple[Key, Condition]]:
 
 def _require_parts(step: AnyStep, able: Abilities) -> None:
     if isinstance(step, ExploreStep) and not able.explorer:
-        raise NotFoundError("explore: the robot's configuration has no section `explorer`")
+        raise NotFoundError("explore: add a section `explorer` to the robot's configuration")
     looks = isinstance(step, PointStep) or (isinstance(step, ExploreStep) and step.find is not None)
     if looks and not able.points:
-        raise NotFoundError(f"{step.do}: the robot's configuration has no section `points`")
+        raise NotFoundError(f"{step.do}: add a section `points` to the robot's configuration")
     if isinstance(step, DockStep | UndockStep) and able.docks is not None:
         try:
             chosen(able.docks, step.dock or "")
@@ -232,7 +232,7 @@ def _require_parts(step: AnyStep, able: Abilities) -> None:
             raise NotFoundError(f"{step.do}: {error}") from None
     if isinstance(step, BehaviourStepOfMission | FollowWallStep):
         if able.behaviour is None:
-            raise NotFoundError(f"{step.do}: the robot's configuration has no section `behaviours`")
+            raise NotFoundError(f"{step.do}: add a section `behaviours` to the robot's configuration")
         able.behaviour(step.name, step.settings if isinstance(step, BehaviourStepOfMission) else {})
 
 
@@ -240,13 +240,13 @@ def _lacking(condition: Condition, able: Abilities, known: frozenset[str] | None
     if not able.charge and (condition.battery_below is not None or condition.battery_above is not None):
         yield "condition on the battery: no device of the robot measures it"
     if not able.points and (condition.point is not None or condition.tags is not None):
-        yield "condition on points of interest: the robot's configuration has no section `points`"
+        yield "condition on points of interest: add a section `points` to the robot's configuration"
     elif condition.point is not None and known is not None and condition.point not in known:
         yield _unknown(condition.point, known)
     if not able.lidar and condition.obstacle is not None:
         yield "condition on obstacles: the robot has no lidar (`devices.lidar`)"
     if not able.zones and condition.zone is not None:
-        yield "condition on zones: the robot's configuration has no section `zones`"
+        yield "condition on zones: add a section `zones` to the robot's configuration"
     inner = (*(condition.any_of or ()), *(() if condition.unless is None else (condition.unless,)))
     for one in inner:
         yield from _lacking(one, able, known)
@@ -254,4 +254,4 @@ def _lacking(condition: Condition, able: Abilities, known: frozenset[str] | None
 
 def _unknown(name: str, known: frozenset[str]) -> str:
     names = ", ".join(sorted(known)[:10]) or "none"
-    return f"no point of interest {name!r} is known and no step explores: known are {names}"
+    return f"point of interest {name!r} is unknown and no step explores: known are {names}"

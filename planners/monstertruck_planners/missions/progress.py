@@ -272,15 +272,15 @@ def _part(node: Mission | AnyStep, block: int, index: int) -> str:
 
 
 def _does_not_hold(condition: Condition | None) -> str:
-    return "" if condition is None else f"{condition_in_words(condition)} does not hold"
+    return "" if condition is None else f"{condition_in_words(condition)}: not fulfilled"
 
 
 def _returned(why: StepEnd, end: StepEnd) -> StepEnd:
     """Return the outcome of a mission whose step failed with ``why`` and whose drive back ended with ``end``."""
     failed = why.text or why.reason.text
     if end.reason in GOOD:
-        return StepEnd(why.reason, f"{failed}, back where it began")
-    return StepEnd(end.reason, f"{failed}; not back where it began: {end.text or end.reason.text}")
+        return StepEnd(why.reason, f"{failed}, back at its start")
+    return StepEnd(end.reason, f"{failed}; not back at its start: {end.text or end.reason.text}")
 
 
 def outcome(progress: MissionProgress, following: Next) -> StepEnd:

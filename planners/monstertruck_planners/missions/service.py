@@ -277,7 +277,7 @@ class MissionService:
         self._source, self._progress = request.source, accepted
         self._began, self._end = self._clock.now(), None
         self._interrupted, self._failed, self._lines = None, "", lines(accepted.mission)
-        text = f"{accepted.mission.name}, {len(accepted.mission.steps)} steps, asked for by {request.source}"
+        text = f"{accepted.mission.name}, {len(accepted.mission.steps)} steps, requested by {request.source}"
         if accepted.number != "1":
             text += f", from step {accepted.number} on"
         self._events(Reason.MISSION_STARTED, Severity.INFO, SOURCE, text)
@@ -313,7 +313,7 @@ class MissionService:
         """Discard an interrupted mission that a client has given up."""
         assert self._group is not None
         self._interrupted = None
-        self._events(Reason.CANCELLED, Severity.INFO, SOURCE, f"{interrupted.mission.name}: given up by {source}")
+        self._events(Reason.CANCELLED, Severity.INFO, SOURCE, f"{interrupted.mission.name}: abandoned by {source}")
         self._keeping = self._group.create_task(self._forget())
 
     def _progress_of(self, request: MissionRequest) -> MissionProgress:
@@ -328,8 +328,11 @@ class MissionService:
         if resumed is not None:
             # 1.0: distance (m) from the interruption beyond which the robot was moved or its odometry was reset
             if not self._localised and not request.moved and (away := resumed.away(pose)) > 1.0:
-                text = f"its pose is {away:.1f} m from where {resumed.mission.name} was interrupted"
-                hint = "if you put it there, resume with `--moved`; else its odometry has restarted (`odometry.start`)"
+                text = f"the pose is {away:.1f} m from the one at which {resumed.mission.name} was interrupted"
+                hint = (
+                    "if you moved the robot, resume with `--moved`; otherwise its odometry has restarted "
+                    "(`odometry.start`)"
+                )
                 raise RequestRefusedError(Reason.POSE_LOST, f"{text}: {hint}")
             return resumed.progress()
         assert request.mission is not None
@@ -617,7 +620,7 @@ class MissionService:
                 silent = silent + 1 if state is newest else 0
                 newest = state
                 if silent > SILENT * MISSION_CHECK_RATE:
-                    return StepEnd(Reason.SERVICE_FAILED, f"nothing was reported on it for {SILENT:g} s")
+                    return StepEnd(Reason.SERVICE_FAILED, f"no report of it for {SILENT:g} s")
                 await schedule.next()
         finally:
             if ended is None:
@@ -740,7 +743,7 @@ class MissionService:
             async with self._writing:
                 await self._offload(lambda: change(file))
         except OSError as error:
-            self._events(disk_reason(error), Severity.WARNING, SOURCE, f"{file}: progress not kept: {error}")
+            self._events(disk_reason(error), Severity.WARNING, SOURCE, f"{file}: progress not saved: {error}")
 
     # Reports
 
@@ -781,4 +784,4 @@ def _where(saved: SavedProgress) -> str:
 
 
 def _over(limit: float) -> StepEnd:
-    return StepEnd(Reason.TIMEOUT, f"not done within {limit:g} s")
+    return StepEnd(Reason.TIMEOUT, f"not finished within {limit:g} s")

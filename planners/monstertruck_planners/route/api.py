@@ -341,7 +341,7 @@ def check_endpoints(
     if not field.free(footprint, a[None], margin if start_margin is None else start_margin)[0]:
         return RouteResult(Reason.START_BLOCKED, text=f"start {_refused(field, footprint, a, margin)}")
     if not field.inside(b[:2]):
-        return RouteResult(Reason.GOAL_OUTSIDE, text=f"goal {_format_pose(b)}: off the map")
+        return RouteResult(Reason.GOAL_OUTSIDE, text=f"goal {_format_pose(b)}: outside the map")
     if field.free(footprint, b[None], margin)[0]:
         return Endpoints(a, b)
     candidates = np.vstack([b + d for d in _tolerance_offsets(position, yaw)])
@@ -354,7 +354,7 @@ def check_endpoints(
 def _refused(field: DistanceField, footprint: Footprint | DiscFootprint, pose: Array, margin: float) -> str:
     """Why a pose that does not keep the margin is refused."""
     overlaps = not field.free(footprint, pose[None])[0]
-    why = "the footprint overlaps an obstacle" if overlaps else f"an obstacle is nearer than {margin:g} m"
+    why = "the footprint overlaps an obstacle" if overlaps else f"an obstacle is closer than {margin:g} m"
     return f"{_format_pose(pose)}: {why}"
 
 

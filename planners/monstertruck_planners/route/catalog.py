@@ -11,7 +11,7 @@ ROUTE_PLANNERS: Final = Catalog(
         name="hybrid",
         settings="monstertruck_planners.route.config:HybridConfig",
         implementation="monstertruck_planners.route.hybrid:HybridPlanner",
-        doc="Hybrid-A* with improvement until the budget is used up",
+        doc="Hybrid-A* with improvement until the time budget is used up",
         extra="planning",
     ),
     Plugin(

@@ -326,7 +326,7 @@ def plan_between(
         if result.ok or not confined or not result.statistics.get("exhausted"):
             return result
     elif isinstance(ends, Endpoints):
-        result = RouteResult(Reason.START_BLOCKED, text=f"start: every motion comes nearer than {config.margin:g} m")
+        result = RouteResult(Reason.START_BLOCKED, text=f"start: every motion comes closer than {config.margin:g} m")
     elif ends.reason is Reason.START_BLOCKED:
         result = ends
     else:
@@ -337,7 +337,7 @@ def plan_between(
     begin, end = np.array(start, dtype=np.float64), np.array(goal, dtype=np.float64)
     ways = departures(route_map, vehicle, begin, config, budget, reserve)
     if not ways.found and not ways.exhausted:
-        away = f"no way found in time to where {config.margin:g} m to obstacles can be kept"
+        away = f"no route found in time to a place with {config.margin:g} m of clearance"
         return RouteResult(Reason.ROUTE_TIMEOUT, text=f"start: {away}")
     for departure in _best(ways.found, route_map, vehicle, config, end):
         ends = _ends(route_map, vehicle, config, departure.end, end)

@@ -46,7 +46,7 @@ class GridAstarPlanner:
         to_go = heuristic.cost_to_go(cell_cost, field.resolution, goal, start, least=int(config.neutral))
         cost = heuristic.cost_at(to_go, *start)
         if cost >= heuristic.UNREACHED:
-            return RouteResult(Reason.GOAL_UNREACHABLE, text="no way over free cells")
+            return RouteResult(Reason.GOAL_UNREACHABLE, text="no path over free cells")
         cells = heuristic.cells_to_goal(to_go.step, *start)
         across, along = (cells[:, 1] + 0.5) * field.resolution, (cells[:, 0] + 0.5) * field.resolution
         points = np.column_stack(

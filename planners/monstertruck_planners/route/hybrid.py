@@ -593,7 +593,7 @@ class _PlanningRun:
             reserve: share of the budget that is kept.
         """
         width = 2 * (self.planner.costs.side + self._gap_margin)
-        too_narrow = None, Reason.GOAL_UNREACHABLE, f"no way {width:.2f} m wide leads there"
+        too_narrow = None, Reason.GOAL_UNREACHABLE, f"no passage {width:.2f} m wide leads there"
         if not self._reachable(to_go):
             return too_narrow
         coarse = [self._search_run(to_go, RESOLUTIONS[0], crab) for crab in crabs]
@@ -617,7 +617,7 @@ class _PlanningRun:
         return (
             None,
             Reason.ROUTE_TIMEOUT,
-            "no drivable way found" + (", all searches exhausted" if fine[-1].exhausted else ""),
+            "no drivable route found" + (", all searches exhausted" if fine[-1].exhausted else ""),
         )
 
     def _search_run(

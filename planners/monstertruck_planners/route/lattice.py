@@ -371,7 +371,7 @@ class LatticePlanner:
         start, goal = (cell_at(field, cell, pose[0], pose[1]) for pose in (ends.start, ends.goal))
         to_go = cost_to_go(route_map.cell_costs(costs), cell, goal, start, overrun=inf)
         if cost_at(to_go, *start) >= UNREACHED:
-            return RouteResult(Reason.GOAL_UNREACHABLE, text=f"no way {2 * costs.closed:.2f} m wide leads there")
+            return RouteResult(Reason.GOAL_UNREACHABLE, text=f"no passage {2 * costs.closed:.2f} m wide leads there")
         best, cost, statistics = None, np.inf, {"expanded": 0.0}
         for weight in (config.heuristic_weight, 0.5 * (1 + config.heuristic_weight), 1.0):
             segments, found, reason = self._search(field, layer, to_go, ends, budget, weight, cost, statistics)
@@ -383,7 +383,7 @@ class LatticePlanner:
         statistics["elapsed_s"] = budget.elapsed
         if best is None:
             statistics["exhausted"] = float(budget.remaining() > 0.0)
-            return RouteResult(reason, text="no drivable way found", statistics=statistics)
+            return RouteResult(reason, text="no drivable route found", statistics=statistics)
         path = MotionPath(ends.start, best, self.vehicle.steering, self.vehicle.reference)
         statistics.setdefault("first_length", path.length)
         return RouteResult(Reason.OK, path, cost=cost, statistics=statistics)

@@ -202,7 +202,7 @@ class MotionPath:
         gap = np.abs(other.start - self.end)
         gap[2] = abs(np.remainder(gap[2] + np.pi, 2 * np.pi) - np.pi)
         if other.reference != self.reference or gap.max() > 1e-3:
-            raise InputError("motion paths: expected the second one to start where the first one ends")
+            raise InputError("motion paths: expected the second to start at the end of the first")
         return replace(
             self, segments=np.vstack((self.segments, other.segments)), steering=(*self.steering, *other.steering)
         )

@@ -46,15 +46,15 @@ def repaired(
     while (found := next(bends(path, config, geometry), None)) is not None:
         bend, _ = found
         if len(texts) == MAX_RUNS or path.closed:
-            limit = "a lap has to be mended by hand" if path.closed else f"expected at most {MAX_RUNS} bends to mend"
+            limit = "a lap must be repaired by hand" if path.closed else f"expected at most {MAX_RUNS} bends to repair"
             raise InputError(f"path {path.name!r}: {limit}")
         piece = _piece(path, bend, config, geometry)
         x, y = path.poses.reshape(-1, 3)[bend.first, :2]
         if free is not None and not (clear := free(piece.poses)).all():
             bx, by = piece.poses[np.flatnonzero(~clear)[0], :2]
             raise InputError(
-                f"path {path.name!r}, pose {bend.first} at {x:.2f}, {y:.2f} m: the turn in its place would touch an "
-                f"obstacle of the map at {bx:.2f}, {by:.2f} m"
+                f"path {path.name!r}, pose {bend.first} at {x:.2f}, {y:.2f} m: the replacement turn would "
+                f"touch an obstacle of the map at {bx:.2f}, {by:.2f} m"
             )
         texts.append(
             f"pose {bend.first} at {x:.2f}, {y:.2f} m: {len(piece.stops)} changes of direction in {piece.length:.2f} m "

@@ -62,7 +62,9 @@ class _Finding(NamedTuple):
         if self.servo.sure:
             parts.append(f"{_percent(self.servo.value)} than calibrated")
         elif self.slip.sure:
-            parts.append(f"{math.degrees(abs(self.slip.value)):.1f} degrees less for each m/s^2 sideways, by slip")
+            parts.append(
+                f"{math.degrees(abs(self.slip.value)):.1f} degrees less for each m/s^2 of lateral acceleration, by slip"
+            )
         elif self.share.sure:
             parts.append(
                 f"{_percent(self.share.value)} than calibrated at {self.speed:.1f} m/s, by its servo or by slip "

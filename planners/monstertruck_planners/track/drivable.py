@@ -58,17 +58,18 @@ def require_drivable(path: Path, config: TrackerConfig, geometry: FourWheelSteer
     if jump is not None:
         index, aside = jump
         raise InputError(
-            f"path {path.name!r}, {_place(path, index)}: the path jumps {aside:.2f} m to the side, which no arc does"
+            f"path {path.name!r}, {_place(path, index)}: the path jumps {aside:.2f} m to the side, which "
+            "no arc can follow"
         )
     for bend, radius in bends(path, config, geometry):
         found = f"turns by {abs(math.degrees(bend.turn)):.0f} degrees in {bend.length:.2f} m"
         if bend.length > LEAST_STEP:
             found += f" (radius {bend.length / abs(bend.turn):.2f} m)"
-        leaves = "does not find back to it" if math.isinf(bend.deviation) else f"leaves it by {bend.deviation:.2f} m"
+        leaves = "does not return to it" if math.isinf(bend.deviation) else f"leaves it by {bend.deviation:.2f} m"
         raise InputError(
-            f"path {path.name!r}, {_place(path, bend.first)}: the path {found}; the robot, whose least radius is "
-            f"{radius:.2f} m, {leaves} (tolerance {tolerance:.2f} m). Draw a change of direction there, or use "
-            "`track --repair`"
+            f"path {path.name!r}, {_place(path, bend.first)}: the path {found}; the robot, with a minimum "
+            f"radius of {radius:.2f} m, {leaves} (tolerance {tolerance:.2f} m). Draw a change of "
+            "direction there, or use `track --repair`"
         )
 
 

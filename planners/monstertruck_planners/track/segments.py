@@ -201,7 +201,7 @@ def check_path(path: Path) -> None:
     if len(path.directions) not in (0, count) or not (np.abs(path.directions) == 1.0).all():
         _refuse(path, f"directions: expected +1 or -1 for each of the {count} poses, or none at all")
     if len(path.steering) not in (0, count):
-        _refuse(path, f"{len(path.steering)} ways of steering: expected one for each of the {count} poses, or none")
+        _refuse(path, f"{len(path.steering)} steering modes: expected one for each of the {count} poses, or none")
     if len(path.clearance) not in (0, count) or np.isnan(path.clearance).any():
         _refuse(path, f"{len(path.clearance)} clearances: expected a number for each of the {count} poses, or none")
     if len(path.speeds) not in (0, count) or not (np.isfinite(path.speeds) & (path.speeds >= 0.0)).all():
@@ -242,7 +242,7 @@ def _distinct(vertices: PosePath, path: Path) -> PosePath:
             break
         kept = kept[np.concatenate(([True], real))]
     if len(kept) < 2:
-        _refuse(path, "expected different poses, all are in one place")
+        _refuse(path, "expected different poses, all are at one position")
     found = vertices.at(kept)
     return replace(found, poses=np.column_stack((found.poses[:, :2], np.unwrap(found.poses[:, 2]))))
 

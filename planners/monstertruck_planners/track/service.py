@@ -227,7 +227,7 @@ class TrackingStep:
             text = (
                 ""
                 if reached
-                else f"path {path.name!r} leads back onto ground that no sensor has seen, from {at[0]:.2f}, {at[1]:.2f}"
+                else f"path {path.name!r} reverses onto ground that no sensor has seen, from {at[0]:.2f}, {at[1]:.2f}"
             )
         if command.outcome is Reason.PATH_LOST:
             text = self._lost(path, command.progress, at)
@@ -279,7 +279,7 @@ class TrackingStep:
             if self._contradicted:
                 reason, severity = Reason.RESPONSE_DIFFERS, Severity.WARNING
             values = axles.model_dump()
-            text = f"dead time and lag are {axles.delay:.3f} s together, configured are {configured.total:.3f} s"
+            text = f"measured dead time plus lag is {axles.delay:.3f} s, configured {configured.total:.3f} s"
             self._report(reason, severity, text, configured=configured.total, **values)
         return axles
 
@@ -410,7 +410,7 @@ class TrackingWorker:
         if inputs.setup is not None:
             self._step, self._newest = TrackingStep(inputs.setup), Newest()
         if self._step is None:
-            raise InputError("tracking: expected a setup before anything else")
+            raise InputError("tracking: expected a setup message first")
         self._newest = self._newest._replace(**inputs.news)
         return self._step.step(inputs.now, self._newest)
 

@@ -68,5 +68,5 @@ def require_free_names(areas: dict[str, ZoneArea]) -> dict[str, ZoneArea]:
         ValueError: one has the name of a mask.
     """
     if taken := areas.keys() & {KEEPOUT_MASK, SPEED_MASK}:
-        raise ValueError(f"{min(taken)}: expected another name, this one is a mask's")
+        raise ValueError(f"{min(taken)}: expected another name, because a mask has this one")
     return areas

@@ -81,7 +81,7 @@ def _masks(config: ZonesConfig, max_speed: float) -> tuple[list[Zone], list[str]
         partly = np.count_nonzero((world.cells > 0) & (world.cells < OCCUPIED))
         if partly:
             remarks.append(
-                f"{keepout.map}: {partly} cells of values 1 to 99, which Nav2 takes for costs: they are free here"
+                f"{keepout.map}: {partly} cells of values 1 to 99, which Nav2 treats as costs: they are free here"
             )
         limits = np.where(world.cells == OCCUPIED, 0.0, np.inf)
         zones += _masked(KEEPOUT_MASK, limits, world, keepout.inside, keepout.map)
@@ -110,7 +110,7 @@ def speed_limits(world: "WorldMap", config: SpeedMaskConfig, max_speed: float) -
 def _masked(name: str, limits: np.ndarray, world: "WorldMap", inside: str, file: Path) -> list[Zone]:
     mask = mask_of(limits, world.resolution, world.origin)
     if mask is None:
-        raise InputError(f"{file}: not one cell of a zone: check image, mode and thresholds")
+        raise InputError(f"{file}: contains no zone cells: check image, mode and thresholds")
     kind = "keepout" if name == KEEPOUT_MASK else "speed"
     return [Zone.model_validate({"name": name, "kind": kind, "mask": mask, "inside": inside})]
 

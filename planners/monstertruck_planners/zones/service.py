@@ -108,7 +108,7 @@ class ZoneService:
         now = self._clock.now()
         for zone in list(self._zones.values()):
             if zone.off_until is not None and now >= zone.off_until:
-                self._turn_on(zone, "its time off is over")
+                self._turn_on(zone, "its time off has expired")
 
     def _look(self) -> None:
         """Update the zones that the robot is in, while its pose is fresh."""
@@ -183,7 +183,7 @@ class ZoneService:
         if area is None:
             raise InputError("zone: area: expected for a new zone")
         if name in (KEEPOUT_MASK, SPEED_MASK):
-            raise InputError(f"zone {name!r}: expected another name, a mask has this one")
+            raise InputError(f"zone {name!r}: expected another name, because a mask has this one")
         if there is not None:
             self._require_own(there, "replaced")
         await self._save(self._areas | {name: area})
@@ -194,7 +194,7 @@ class ZoneService:
     @staticmethod
     def _require_own(zone: Zone, what: str) -> None:
         if not zone.saved:
-            raise InputError(f"zone {zone.name!r}: it belongs to the configuration: expected to be {what} there")
+            raise InputError(f"zone {zone.name!r}: is defined in the configuration: expected to be {what} there")
 
     async def _save(self, areas: dict[str, ZoneArea]) -> None:
         """Write the operators' zones and keep them.

@@ -1,1 +1,1 @@
-"""Heavy work in separate processes, so that it never stalls the event loop."""
+"""Actors: heavy work in separate processes, so that it never blocks the event loop."""

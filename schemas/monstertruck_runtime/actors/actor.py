@@ -1,6 +1,7 @@
-"""Execution of a pure step: in the loop, in a worker process, or on another machine; one word changes it.
+"""Runs a pure step in the event loop, in a worker process, or on another machine, as configured.
 
-Actors keep their state from step to step. A worker is a separate process, with deadline, kill and restart.
+Actors keep their state from step to step. A worker is a separate process with a deadline; it is killed and restarted on
+failure.
 """
 
 import asyncio
@@ -26,37 +27,37 @@ Placement = Literal["loop", "worker", "remote"]
 
 
 class Actor(Protocol):
-    """Something that takes steps, one at a time, and keeps its state between them until one fails."""
+    """Executes steps one at a time, and keeps its state between them until a step fails."""
 
     async def __aenter__(self) -> Self:
-        """Begin."""
+        """Start the actor."""
 
     async def __aexit__(self, *_: object) -> None:
-        """End."""
+        """End the actor."""
 
     async def start(self) -> None:
-        """Make ready for the first step."""
+        """Prepare for the first step."""
 
     async def step(self, inputs: Any) -> Any:
-        """Take one step."""
+        """Execute one step."""
 
 
 class ResultDelivery(Protocol):
-    """Delivery time of a worker's result on a virtual clock."""
+    """Decides when a worker's result is delivered on a virtual clock."""
 
     async def wait(self, clock: VirtualClock, due: int) -> None:
-        """Return when a result that is due at ``due``, ns, may be delivered."""
+        """Return when a result due at ``due`` (ns) may be delivered."""
 
 
 class VirtualDelivery:
-    """Delivers results at their instants; results due together in the order of submission."""
+    """Delivers results when they are due; results due together in the order of submission."""
 
     def __init__(self) -> None:
         self._sequence = itertools.count()
         self._waiting: list[tuple[int, int, asyncio.Future[None]]] = []
 
     async def wait(self, clock: VirtualClock, due: int) -> None:
-        """Wait until ``due``, ns."""
+        """Wait until ``due`` (ns)."""
         delivered: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         heapq.heappush(self._waiting, (due, next(self._sequence), delivered))
         self._set_timer(clock, due)
@@ -68,7 +69,7 @@ class VirtualDelivery:
 
     def _deliver(self, clock: VirtualClock, due: int) -> None:
         now = clock.now()
-        if now < due:  # timers count in float seconds
+        if now < due:  # timers use float seconds
             self._set_timer(clock, due)
             return
         while self._waiting and self._waiting[0][0] <= now:
@@ -81,12 +82,12 @@ _deliveries: "weakref.WeakKeyDictionary[VirtualClock, ResultDelivery]" = weakref
 
 
 def delivery_of(clock: VirtualClock) -> ResultDelivery:
-    """The one delivery that all workers of a clock share."""
+    """Return the delivery shared by all workers of a clock."""
     return _deliveries.setdefault(clock, VirtualDelivery())
 
 
 def use_delivery(clock: VirtualClock, delivery: ResultDelivery) -> None:
-    """Let ``delivery`` decide when the results of all workers of ``clock`` count."""
+    """Let ``delivery`` decide when the results of all workers of ``clock`` are delivered."""
     _deliveries[clock] = delivery
 
 
@@ -95,14 +96,14 @@ def _factor(computer: SlowComputer | None) -> float:
 
 
 class LoopActor:
-    """The step in the caller's own loop, which is blocked meanwhile.
+    """Runs the step in the caller's event loop, which is blocked meanwhile.
 
-    On the virtual clock the result is delivered when a worker's would be.
+    On the virtual clock the result is delivered at the same time as a worker's.
 
     Args:
         target: ``module:factory``, as for ``WorkerActor``.
-        clock: time.
-        latency: declared seconds of a step; virtual clock only.
+        clock: source of time.
+        latency: declared duration of a step, s; virtual clock only.
     """
 
     def __init__(self, target: str, clock: Clock, latency: float) -> None:
@@ -112,13 +113,13 @@ class LoopActor:
         self._step: Any = None
 
     async def start(self) -> None:
-        """Build the object that takes the steps."""
+        """Build the object that executes the steps."""
         if self._step is None:
             module, _, factory = self._target.partition(":")
             self._step = getattr(importlib.import_module(module), factory)()
 
     async def step(self, inputs: Any) -> Any:
-        """Take one step; if it raises, the next one finds a fresh state."""
+        """Execute one step; after an exception the next step starts with a fresh state."""
         await self.start()
         submitted = self._clock.now()
         try:
@@ -139,25 +140,25 @@ class LoopActor:
 
 
 class WorkerActor:
-    """One worker process and the steps it is asked to take; an async context manager that ends it.
+    """One worker process and its steps; an async context manager that ends the process.
 
-    Steps are taken one at a time, in the order of their calls. A worker that fails, hangs, dies or whose step is
-    cancelled is killed; the next step starts a fresh one, without the state of the old.
+    Steps are executed one at a time, in the order of their calls. A worker that fails, hangs or dies, or whose step is
+    cancelled, is killed; the next step starts a new worker with a fresh state.
 
-    On the wall clock a result is delivered as soon as it is there. On the virtual clock it is delivered exactly
-    ``latency`` after submission: the loop stops the real time at that instant until the process is done, and results
-    due together come in the order of submission, so that runs are reproducible. On a ``SlowComputer`` both the latency
-    and the processor time that the step has really used are longer by its factor, and the longer one counts.
+    On the wall clock a result is delivered as soon as it is available. On the virtual clock it is delivered exactly
+    ``latency`` after submission: the loop waits in real time at that instant until the process is done. Results due
+    together are delivered in the order of submission, so runs are reproducible. On a ``SlowComputer`` the latency and
+    the measured processor time of the step are multiplied by its factor, and the longer of the two is used.
 
     Args:
         name: for error texts, and ``ActorFactory.worker_pids``.
         target: ``module:factory``; the factory's object has ``step(inputs) -> outputs``, both picklable.
-        clock: time.
-        latency: declared seconds of a step on the reference computer.
+        clock: source of time.
+        latency: declared duration of a step on the reference computer, s.
         deadline: time limit of a step, s.
-        start_timeout: real seconds a start may take.
-        answer_timeout: maximum real seconds without an answer, or more of it; on the virtual clock from the result's
-            instant on. Default: ``start_timeout``.
+        start_timeout: maximum real time of a start, s.
+        answer_timeout: maximum real time without an answer or a further part of it, s; on the virtual clock measured
+            from the time when the result is due. Default: ``start_timeout``.
     """
 
     def __init__(
@@ -181,24 +182,24 @@ class WorkerActor:
         self._virtual = isinstance(clock, VirtualClock)
         self._process: WorkerProcess | None = None
         self._thread: ThreadPoolExecutor | None = None
-        """Waits for the process: for a minute, maybe, which must not take a place from other blocking work."""
+        """Threads that wait for the process, perhaps for a minute, without blocking other work."""
         self._built = False
-        """The process has reported that it can take steps."""
+        """Whether the process has reported that it is ready for steps."""
         self._lock = asyncio.Lock()
 
     @property
     def pid(self) -> int | None:
-        """Process number of the running worker; None before its start and after its end."""
+        """Process id of the running worker; None before its start and after its end."""
         return None if self._process is None else self._process.pid
 
     async def start(self) -> None:
-        """Start the process if it does not run; a step does so itself, this only saves it the wait.
+        """Start the process if it is not running. A step does so itself; this avoids the wait.
 
-        On the virtual clock it returns at once: the first step waits for the process and raises what went wrong.
+        On the virtual clock it returns at once: the first step waits for the process and raises its error.
 
         Raises:
             WorkerError: the factory failed (wall clock).
-            WorkerTimeoutError: it took longer than ``start_timeout`` (wall clock).
+            WorkerTimeoutError: the start exceeded ``start_timeout`` (wall clock).
         """
         async with self._lock:
             if not self._virtual:
@@ -207,7 +208,7 @@ class WorkerActor:
                 self._spawn()
 
     async def step(self, inputs: Any) -> Any:
-        """Take one step.
+        """Execute one step.
 
         Raises:
             WorkerTimeoutError: the deadline passed; the worker was killed.
@@ -222,7 +223,7 @@ class WorkerActor:
                 raise
 
     async def close(self) -> None:
-        """End the process. Closing twice is harmless; a step under way fails with ``WorkerError``."""
+        """End the process. Repeated calls have no effect; a step in progress fails with ``WorkerError``."""
         await self._discard()
 
     async def _started(self) -> WorkerProcess:
@@ -298,7 +299,10 @@ class WorkerActor:
         return await asyncio.get_running_loop().run_in_executor(self._thread, function)
 
     async def _blocking(self, function: Callable[[], T]) -> T:
-        """Wait; on the virtual clock no virtual time passes meanwhile, on the wall clock the loop continues."""
+        """Wait for a call in a thread.
+
+        On the virtual clock no virtual time passes, on the wall clock the loop continues.
+        """
         return function() if self._virtual else await in_thread(function)
 
     async def __aenter__(self) -> Self:
@@ -309,11 +313,11 @@ class WorkerActor:
 
 
 class ActorFactory:
-    """Makes the actors of one daemon.
+    """Creates the actors of one daemon.
 
     Args:
-        clock: time.
-        remote: where other machines call for work.
+        clock: source of time.
+        remote: remote actors, for steps placed on other machines.
     """
 
     def __init__(self, clock: Clock, remote: RemoteWorkQueue) -> None:
@@ -322,7 +326,7 @@ class ActorFactory:
         self._workers: list[WorkerActor] = []
 
     def worker_pids(self) -> dict[str, int]:
-        """Process numbers of the workers that run, by name."""
+        """Process ids of the running workers, by name."""
         return {worker.name: worker.pid for worker in self._workers if worker.pid is not None}
 
     def actor(
@@ -335,7 +339,7 @@ class ActorFactory:
         deadline: float,
         start_timeout: float = 30.0,
     ) -> Actor:
-        """An actor; arguments as for ``WorkerActor``; a placement ignores arguments that it does not use."""
+        """Create an actor; arguments as for ``WorkerActor``; a placement ignores arguments that it does not use."""
         match placement:
             case "loop":
                 return LoopActor(target, self._clock, latency)

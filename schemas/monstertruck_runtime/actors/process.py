@@ -1,4 +1,4 @@
-"""A worker process, and the fork server that starts it, from the parent's side; ``server`` is the other."""
+"""Parent's side of a worker process and of the fork server that starts it; ``server`` is the other side."""
 
 import atexit
 import os
@@ -16,25 +16,28 @@ from monstertruck_runtime.actors import server
 from monstertruck_runtime.errors import WorkerError
 
 _TIMEVAL = struct.Struct("@ll")
-"""Seconds and microseconds, see socket(7)."""
+"""Seconds and microseconds of a socket timeout, see socket(7)."""
 _SINGLE_THREADED = {
     f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMEXPR", "NUMBA", "VECLIB")
 }
 _END_TIMEOUT: Final = 5.0
-"""Time a killed process may take to end and its server to report that (s); a server that takes longer hangs."""
+"""Maximum time for a killed process to end and for its server to report that (s); a slower server is considered
+hung.
+"""
 
 
 class ForkServer:
-    """The process that forks the workers of this one; started by the first request (``server``).
+    """Process that forks the workers of this process; the first request starts it (``server``).
 
-    It is a fresh interpreter, never a fork of this process: forked Zenoh sessions hang. It ends with this process.
+    It is a fresh interpreter, never a fork of this process, because forked Zenoh sessions hang. It ends with this
+    process.
     """
 
     def __init__(self) -> None:
         self._sending = threading.Lock()
-        """Held while a request is sent, or ``_waiting`` is used."""
+        """Held while sending a request or using ``_waiting``."""
         self._waiting: list[socket.socket] = []
-        """Forks that ``forget`` has not removed, in the order of the requests."""
+        """Pending forks, in the order of their requests; removed by ``forget``."""
         self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             self._process = subprocess.Popen(  # noqa: S603  # our own interpreter and module
@@ -47,24 +50,24 @@ class ForkServer:
 
     @property
     def pid(self) -> int:
-        """Process number."""
+        """Process id."""
         return self._process.pid
 
     @property
     def lost(self) -> bool:
-        """Whether it has ended."""
+        """Whether the server has ended."""
         return self._process.poll() is not None
 
     def fork(self, name: str, target: str, connection: socket.socket) -> socket.socket:
-        """Request a worker; returns the socket that receives its process number, then its exit code.
+        """Request a worker; return the socket that receives its process id, then its exit code.
 
         Args:
-            name: shown by ``ps`` and ``top``.
+            name: name shown by ``ps`` and ``top``.
             target: ``module:factory``.
             connection: the worker's end of its connection.
 
         Raises:
-            WorkerError: the server is gone, or does not read its requests.
+            WorkerError: the server has ended, or does not read its requests.
         """
         environment = {**os.environ, **_SINGLE_THREADED}
         packet = server.ForkRequest(name, target, sys.path, environment).encode()
@@ -84,31 +87,31 @@ class ForkServer:
         return ours
 
     def unanswered(self) -> socket.socket | None:
-        """The request that the server works on: the socket of the oldest one without an answer; None if it idles."""
+        """Socket of the request in progress, the oldest one without an answer; None if the server is idle."""
         with self._sending:
             return next((end for end in self._waiting if not server.readable(end.fileno())), None)
 
     def forget(self, end: socket.socket) -> None:
-        """Note that a request, given by its socket, is answered or given up; call it before the socket is closed."""
+        """Remove an answered or abandoned request, given by its socket; must be called before the socket is closed."""
         with self._sending, suppress(ValueError):
             self._waiting.remove(end)
 
     def kill(self) -> None:
-        """Kill the server, and leave no zombie; its workers run on."""
+        """Kill the server and collect its exit status; its workers continue."""
         self._process.kill()
         self._process.wait()
         self._requests.close()
 
 
 class _Current:
-    """The fork server that is in use, replaced when it has ended."""
+    """The current fork server; replaced after it has ended."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._server: ForkServer | None = None
 
     def server(self) -> ForkServer:
-        """Return a server, a new one if the last has ended."""
+        """Return the server; start a new one if the last one has ended."""
         with self._lock:
             if self._server is not None and self._server.lost:
                 self.kill()
@@ -117,7 +120,7 @@ class _Current:
             return self._server
 
     def kill(self) -> None:
-        """Kill the server at the end of this process; it would end by itself, but only after its imports."""
+        """Kill the server at the end of this process; it would end by itself only after its imports."""
         if self._server is not None:
             self._server.kill()
             self._server = None
@@ -128,12 +131,12 @@ atexit.register(_current.kill)
 
 
 class WorkerProcess:
-    """A process that takes steps, forked by the process's ``ForkServer``.
+    """A process that executes steps, forked by the ``ForkServer`` of this process.
 
     Args:
         name: for error texts.
         target: ``module:factory``; the factory's object has ``step(inputs) -> outputs``.
-        stall_timeout: maximum pause in the middle of a message, either way, s.
+        stall_timeout: maximum pause within a message, in either direction, s.
     """
 
     def __init__(self, name: str, target: str, stall_timeout: float = 30.0) -> None:
@@ -144,7 +147,7 @@ class WorkerProcess:
         self._reading = threading.Lock()
         """Held while a thread reads ``_end``."""
         self.used = 0.0
-        """Processor time of the latest step (s)."""
+        """Processor time of the last step (s)."""
         ours, theirs = socket.socketpair()
         limit = _TIMEVAL.pack(*divmod(round(stall_timeout * 1e6), 10**6))
         for direction in (socket.SO_SNDTIMEO, socket.SO_RCVTIMEO):
@@ -156,7 +159,7 @@ class WorkerProcess:
 
     @property
     def pid(self) -> int | None:
-        """Process number; None until the server has forked it."""
+        """Process id; None until the server has forked it."""
         if self._pid is None and not self._killed and self._reading.acquire(blocking=False):
             try:
                 self._pid = self._reported(0.0)
@@ -168,7 +171,7 @@ class WorkerProcess:
         """Submit a step.
 
         Raises:
-            WorkerError: the process is gone, or stopped.
+            WorkerError: the process has ended or is stopped.
         """
         try:
             self._connection.send(inputs)
@@ -179,8 +182,8 @@ class WorkerProcess:
         """Wait for the outputs of a step, or for the message that the worker is built; sets ``used``.
 
         Raises:
-            WorkerError: the process is gone, or its code raised; the text begins with why, and holds the traceback.
-            TimeoutError: nothing came for ``timeout`` seconds, or the process stopped in the middle of its answer.
+            WorkerError: the process ended, or its code raised an exception; the text contains the traceback.
+            TimeoutError: no data for ``timeout`` seconds, or the process stopped in the middle of its answer.
         """
         try:
             if not self._connection.poll(timeout):
@@ -198,16 +201,16 @@ class WorkerProcess:
         return value
 
     def exchange(self, inputs: Any) -> Any:
-        """``send``, then ``receive``, without time-outs; ends when the process is killed."""
+        """Call ``send``, then ``receive``, without timeouts; ends when the process is killed."""
         self.send(inputs)
         return self.receive()
 
     def kill(self) -> None:
-        """Kill the process, and an idle server that does not confirm its end; neither leaves a zombie.
+        """Kill the process, and an idle server that does not confirm its end; collect both exit statuses.
 
-        A server that builds may be in one call of a library for longer than that.
+        A server may spend longer than that in one library call while it builds.
 
-        The connection ends with its last user: a thread may still wait for it.
+        The last user closes the connection: a thread may still wait for it.
         """
         if self._killed:
             return
@@ -220,7 +223,7 @@ class WorkerProcess:
             self._pid = self._pid or self._reported(0.0)
             if self._pid is not None and self._code is None:
                 self._code = self._reported(0.0)
-            # Another process may have the number of one that has ended.
+            # The process id of an ended process may be reused.
             ended = self._code is not None or (closed and self._server.lost)
             if self._pid is not None and not ended:
                 with suppress(ProcessLookupError):
@@ -232,15 +235,18 @@ class WorkerProcess:
             self._end.close()
 
     def kill_hung_server(self) -> None:
-        """Kill the server if it still works on this process; for a start that took too long.
+        """Kill the server if it is still starting this process; for a start that took too long.
 
-        While it builds another kind it does not hang: that one has a time limit of its own.
+        A server that builds another kind is not hung: that build has its own timeout.
         """
         if self._server.unanswered() is self._end:
             self._server.kill()
 
     def _reported(self, timeout: float) -> int | None:
-        """Read the next number on ``_end``; None if none came for ``timeout`` seconds, or the server is gone."""
+        """Read the next number on ``_end``.
+
+        None if none was received for ``timeout`` seconds, or the server has ended.
+        """
         try:
             self._end.settimeout(timeout)
             data = self._end.recv(server.NUMBER.size)
@@ -250,18 +256,18 @@ class WorkerProcess:
         return server.NUMBER.unpack(data)[0] if data else None
 
     def _gone(self) -> str:
-        """That the process is gone, and how it ended."""
+        """Error that tells how the process ended."""
         with self._reading:
             self._pid = self._pid or self._reported(0.0)
             text = f"worker {self._name} (process {self._pid or 'never forked'}) is gone"
             if self._killed:
                 return text
-            # 1.0: time a process may take to end after it has closed its connection (s)
+            # 1.0: time for a process to end after it has closed its connection (s)
             self._code = self._reported(1.0) if self._code is None else self._code
         code = self._code
         if code is None:
             return f"{text}: it closed its connection"
         if code >= 0:
             return f"{text}: it ended with exit code {code}"
-        short = ", as by a system that is short of memory" if -code == signal.SIGKILL else ""
+        short = ", as by the out-of-memory killer" if -code == signal.SIGKILL else ""
         return f"{text}: killed by {signal.Signals(-code).name}{short}"

@@ -1,7 +1,7 @@
-"""Steps on another machine: it calls the robot for work and returns the outputs.
+"""Steps on another machine, which requests work from the robot and returns the outputs.
 
-So the robot listens as always, and any client that may call it may compute for it (``monstertruckd plan-server``).
-Messages are JSON of known classes, see ``StepCodec``; no received content is executed.
+The robot listens as usual, and any permitted client may compute for it (``monstertruckd plan-server``). Messages are
+JSON of known classes, see ``StepCodec``; received content is never executed.
 """
 
 import asyncio
@@ -30,20 +30,20 @@ log = logging.getLogger(__name__)
 
 RPC: Final = "remote_step"
 POLL: Final = 2.0
-"""Seconds a caller waits for work."""
+"""Seconds that a caller waits for work."""
 PART: Final = 8192
-"""Characters of outputs in one call."""
+"""Maximum number of characters of outputs in one call."""
 REMOTE_RETRY: Final = 1.0
-"""Seconds between two tries to reach a robot."""
+"""Seconds between two attempts to reach a robot."""
 _DTYPES: Final = ("float64", "int8", "uint8", "int64")
 
 
 class StepCodec:
-    """Converts trees of known classes, arrays, tuples, lists, dicts with text keys, paths and scalars.
+    """Converts trees of known classes, arrays, tuples, lists, dicts with text keys, paths and scalars to JSON and back.
 
     Args:
-        roots: dataclasses and ``Schema`` models that may travel. Known are these and every dataclass, model and enum
-            that their fields hold, the settings of plug-ins included.
+        roots: dataclasses and ``Schema`` models that may be sent. These and all dataclasses, models and enums in their
+            fields, including the settings of plug-ins, are known.
     """
 
     def __init__(self, *roots: type[Any]) -> None:
@@ -61,10 +61,10 @@ class StepCodec:
         return found
 
     def to_json(self, value: Any) -> Any:
-        """The value as what JSON can say.
+        """Convert a value to JSON-compatible data.
 
         Raises:
-            InputError: a class that is not known.
+            InputError: the class is unknown.
         """
         match value:
             case Enum() if self._knows(value):
@@ -83,7 +83,7 @@ class StepCodec:
             case dict():
                 return {"dict": [[key, self.to_json(inner)] for key, inner in value.items()]}
         if not self._knows(value):
-            raise InputError(f"step: no {type(value).__name__} travels to another machine")
+            raise InputError(f"step: a {type(value).__name__} cannot be sent to another machine")
         names = type(value).model_fields if isinstance(value, Schema) else [f.name for f in dataclasses.fields(value)]
         return {
             "class": _name(type(value)),
@@ -91,15 +91,15 @@ class StepCodec:
         }
 
     def from_json(self, value: Any) -> Any:
-        """Back.
+        """Convert JSON-compatible data back.
 
         Raises:
-            InputError: nothing that ``to_json`` makes.
+            InputError: the data is not a result of ``to_json``.
         """
         try:
             return self._back(value)
         except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"step: not readable: {type(error).__name__}: {error}") from error
+            raise InputError(f"step: cannot be decoded: {type(error).__name__}: {error}") from error
 
     def _knows(self, value: Any) -> bool:
         return self._classes.get(_name(type(value))) is type(value)
@@ -127,12 +127,12 @@ class StepCodec:
     def _named(self, name: str, base: type[Any]) -> type[Any]:
         found = self._classes[name]
         if not issubclass(found, base):
-            raise TypeError(f"{name} is no {base.__name__}")
+            raise TypeError(f"{name} is not a {base.__name__}")
         return found
 
 
 def _name(cls: type[Any]) -> str:
-    """Plug-ins of two distributions may use one class name."""
+    """Plug-ins of two distributions may use the same class name."""
     return f"{cls.__module__}.{cls.__qualname__}"
 
 
@@ -149,14 +149,14 @@ def _annotations(cls: type[Any]) -> list[Any]:
 
 
 class RemoteActor:
-    """One kind of steps, taken by a plan server that calls for them; the latest caller replaces the one before.
+    """One kind of steps, executed by a plan server that requests work; a new caller replaces the previous one.
 
     Args:
-        name: name of the steps, for the caller.
+        name: name of the steps, used by the caller.
         codec: codec of their inputs and outputs.
-        clock: time.
-        deadline: seconds for a step.
-        start_timeout: seconds to wait for a caller.
+        clock: source of time.
+        deadline: maximum duration of a step, s.
+        start_timeout: maximum wait for a caller, s.
     """
 
     def __init__(self, name: str, codec: StepCodec, clock: Clock, *, deadline: float, start_timeout: float) -> None:
@@ -175,22 +175,24 @@ class RemoteActor:
         """Wait for the first call.
 
         Raises:
-            WorkerTimeoutError: none came in time.
+            WorkerTimeoutError: no caller in time.
         """
         try:
             async with self._clock.deadline(self._start_timeout):
                 while self._server is None:
                     await self._wait()
         except TimeoutError:
-            raise WorkerTimeoutError(f"{self._name}: no plan-server called for {self._start_timeout:g} s") from None
+            raise WorkerTimeoutError(
+                f"{self._name}: no plan-server connected within {self._start_timeout:g} s"
+            ) from None
         self._changed = False
 
     async def step(self, inputs: Any) -> Any:
-        """Take one step there.
+        """Execute one step on the plan server.
 
         Raises:
             WorkerTimeoutError: no outputs in time.
-            WorkerError: the step failed, or another server took over, which knows nothing yet.
+            WorkerError: the step failed, or another server without the current state took over.
         """
         async with self._lock:
             if self._changed:
@@ -209,10 +211,10 @@ class RemoteActor:
                 self._task = self._result = None
 
     async def serve(self, payload: dict[str, Any]) -> dict[str, Any]:
-        """One call: takes outputs, answers with the next inputs once there are some.
+        """Serve one call: accept outputs, and answer with the next inputs when available.
 
         Raises:
-            InputError: the call makes no sense.
+            InputError: the call is invalid.
         """
         server = payload.get("server")
         if not isinstance(server, str) or not 0 < len(server) <= 64:
@@ -243,7 +245,7 @@ class RemoteActor:
     def _take(self, payload: dict[str, Any]) -> bool:
         """Whether these outputs are complete."""
         self._parts.append(str(payload["part"]))
-        most = 1_000_000  # characters of outputs at all
+        most = 1_000_000  # maximum total number of characters of outputs
         if sum(map(len, self._parts)) > most:
             self._parts = []
             raise InputError(f"outputs: more than {most} characters")
@@ -288,16 +290,16 @@ class RemoteWorkQueue:
         self._actors: dict[str, RemoteActor] = {}
 
     def actor(self, name: str, clock: Clock, *, deadline: float, start_timeout: float) -> RemoteActor:
-        """A new one."""
+        """Create a remote actor."""
         self._actors[name] = RemoteActor(name, self._codec, clock, deadline=deadline, start_timeout=start_timeout)
         return self._actors[name]
 
     async def serve(self, payload: dict[str, Any]) -> dict[str, Any]:
-        """One call of a server.
+        """Serve one call of a server.
 
         Raises:
-            NotFoundError: no such steps are placed elsewhere.
-            InputError: the call makes no sense.
+            NotFoundError: no such steps are placed on another machine.
+            InputError: the call is invalid.
         """
         actor = self._actors.get(str(payload.get("actor")))
         if actor is None:
@@ -311,12 +313,12 @@ async def serve(
     steps: Mapping[str, str],
     codec: StepCodec,
 ) -> None:
-    """Serve a robot until cancelled, over all its restarts.
+    """Serve a robot until cancelled, across its restarts.
 
     Args:
-        clock: time.
+        clock: source of time.
         connect: opens a client of the robot; its calls may take twice ``POLL``.
-        steps: what can be computed here: ``module:factory`` by name.
+        steps: available steps, ``module:factory`` by name.
         codec: codec of inputs and outputs.
     """
     while True:
@@ -328,12 +330,12 @@ async def serve(
                 for name, target in steps.items():
                     tasks.create_task(work(client, clock, name, target, codec, f"{client.source[:40]}.{clock.now():x}"))
         except* TruckError as group:
-            log.warning("%s; tries again", group.exceptions[0])
+            log.warning("%s; retrying", group.exceptions[0])
         await clock.sleep(REMOTE_RETRY)
 
 
 async def work(caller: Operator, clock: Clock, name: str, target: str, codec: StepCodec, server: str) -> None:
-    """Call for one kind of steps, take them, bring the outputs; until cancelled.
+    """Request one kind of steps, execute them and return the outputs, until cancelled.
 
     Raises:
         TruckError: the robot is gone.

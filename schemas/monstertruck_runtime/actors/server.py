@@ -1,10 +1,10 @@
 """Main program of the fork server, and of the workers that it forks.
 
-``python -m monstertruck_runtime.actors.server FD`` forks a worker per request until its parent is gone, in the middle
-of a build too. It has one thread, hence its forks are safe. It builds a worker of each kind once and discards it: forks
-then share the imported modules and the compiled kernels. Builds and workers go behind the daemon's loop: both are
-niced. Signals to the daemon's whole group are ignored: the parent decides when its workers end. Imports stay few, for
-every worker shares them.
+``python -m monstertruck_runtime.actors.server FD`` forks a worker per request until its parent ends, even during a
+build. It has one thread, so its forks are safe. It builds a worker of each kind once and discards it, so that forks
+share the imported modules and the compiled kernels. Builds and workers are niced, so that the daemon's loop has
+priority. Signals to the daemon's process group are ignored: the parent decides when its workers end. This module
+imports little, because every worker shares the imports.
 """
 
 import fcntl
@@ -28,16 +28,16 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 NUMBER: Final = struct.Struct("@i")
-"""A process number, then its exit code (negative: the signal), on a worker's socket of its end."""
+"""Number sent on the socket of a worker's end: its process id, then its exit code (negative: the signal)."""
 _LONGEST: Final = 1 << 20
-"""Maximum length of a request, environment included (bytes)."""
+"""Maximum size of a request, including the environment (bytes)."""
 
 
 @dataclass(frozen=True)
 class ForkRequest:
-    """A worker to be forked.
+    """Request to fork a worker.
 
-    Its file descriptors travel beside it: the worker's connection, the socket of its end, the current folder.
+    It is sent together with file descriptors: the worker's connection, the socket of its end, the current folder.
     """
 
     name: str
@@ -64,10 +64,10 @@ class _Server:
         self._requests = requests
         self._built: set[str] = set()
         self._ends: dict[int, int] = {}
-        """File descriptor that takes a worker's exit code, by process number."""
+        """File descriptor for a worker's exit code, by process id."""
 
     def run(self) -> None:
-        """Serve until the parent is gone."""
+        """Serve until the parent ends."""
         signal.signal(signal.SIGCHLD, self._reap)
         signal.signal(signal.SIGIO, self._end_with_parent)
         fcntl.fcntl(self._requests, fcntl.F_SETOWN, os.getpid())
@@ -86,7 +86,7 @@ class _Server:
                 os.close(descriptor)
 
     def _build(self, request: ForkRequest) -> None:
-        """Load what all workers of a target share; the worker itself reports what fails here."""
+        """Load everything that the workers of a target share; the worker itself reports failures."""
         if request.target in self._built:
             return
         sys.path[:] = request.path
@@ -94,7 +94,7 @@ class _Server:
             _made(request.target)
             self._built.add(request.target)
         gc.collect()
-        gc.freeze()  # a collection in a fork would copy the shared pages
+        gc.freeze()  # a garbage collection in a fork would copy the shared pages
 
     def _fork(self, request: ForkRequest, connection: int, end: int, folder: int) -> None:
         signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGCHLD,))
@@ -119,40 +119,40 @@ class _Server:
         os.close(folder)
 
     def _reap(self, *_: object) -> None:
-        for process in tuple(self._ends):  # not any child: a build may wait for a program of its own
+        for process in tuple(self._ends):  # not any child: a build may wait for a subprocess
             try:
                 ended, status = os.waitpid(process, os.WNOHANG)
-            except ChildProcessError:  # the next signal came in this function, and has seen to it
+            except ChildProcessError:  # the next signal arrived within this function and was handled
                 continue
             if not ended:
                 continue
             end = self._ends.pop(process)
-            with suppress(OSError):  # the parent may no longer care
+            with suppress(OSError):  # the parent may have closed it
                 os.write(end, NUMBER.pack(os.waitstatus_to_exitcode(status)))
             os.close(end)
 
     def _end_with_parent(self, *_: object) -> None:
-        """End at once when the parent is gone; the kernel sends SIGIO for a request, too."""
+        """End at once when the parent has ended; the kernel also sends SIGIO for a request."""
         if closed(self._requests.fileno()):
             os._exit(0)
 
 
 def readable(connection: int) -> bool:
-    """Whether something waits to be read, or the other side has closed a connection, given by its file descriptor."""
+    """Whether data can be read or the peer has closed a connection, given by its file descriptor."""
     poll = select.poll()
     poll.register(connection, select.POLLIN)
     return bool(poll.poll(0))
 
 
 def closed(connection: int) -> bool:
-    """Whether the other side has closed a connection, given by its file descriptor."""
+    """Whether the peer has closed a connection, given by its file descriptor."""
     poll = select.poll()
     poll.register(connection, select.POLLHUP)
     return bool(poll.poll(0))
 
 
 def main() -> int:
-    """Serve one parent; returns the exit code."""
+    """Serve one parent; return the exit code."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     os.nice(5)
@@ -166,7 +166,7 @@ def _made(target: str) -> Any:
 
 
 def _become(request: ForkRequest) -> None:
-    """Turn a fork of the server into what a fresh process of the parent would be."""
+    """Make a fork of the server equivalent to a fresh process of the parent."""
     for number in (signal.SIGCHLD, signal.SIGIO):
         signal.signal(number, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGCHLD,))
@@ -179,7 +179,7 @@ def _become(request: ForkRequest) -> None:
 
 
 def _work(connection: Connection, target: str) -> int:
-    """Build the worker and answer steps until the parent is gone, however busy it is then; returns the exit code."""
+    """Build the worker and execute steps until the parent ends, even if it ends during a step; return the exit code."""
     steps: queue.SimpleQueue[Any] = queue.SimpleQueue()
     threading.Thread(target=_read, args=(connection, steps), daemon=True).start()
     try:
@@ -196,7 +196,7 @@ def _work(connection: Connection, target: str) -> int:
 
 
 def _processor_time() -> float:
-    """Processor time of this thread (s); the clock's module would cost every worker the import of asyncio."""
+    """Processor time of this thread (s); the clock module would make every worker import asyncio."""
     usage = resource.getrusage(resource.RUSAGE_THREAD)
     return usage.ru_utime + usage.ru_stime
 

@@ -1,7 +1,7 @@
-"""The wire codec: topic messages to bytes and back, the same bytes for Zenoh and for MCAP.
+"""Wire codec: converts topic messages to bytes and back, with the same bytes for Zenoh and MCAP.
 
-Topics with a well-known schema travel as protobuf, all others as JSON with JSON Schema. The wire ignores
-fields it does not know and only ever grows.
+Topics with a well-known schema are encoded as protobuf, all others as JSON with JSON Schema. Readers ignore unknown
+fields; schemas only gain fields.
 """
 
 import json
@@ -22,7 +22,7 @@ M = TypeVar("M", bound=Message)
 
 
 _BYTE: Final = re.compile("[\udc80-\udcff]")
-"""What Python reads for a byte that it cannot decode (PEP 383)."""
+"""Surrogates that Python reads for undecodable bytes (PEP 383)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ def encode(topic: Topic[M], message: M) -> bytes:
     """Serialize ``message``.
 
     Raises:
-        InputError: the message is not of the topic's type or contradicts itself.
+        InputError: the message has another type than the topic, or is inconsistent.
     """
     if type(message) is not topic.model:
         msg = f"{topic.name}: expected {topic.model.__name__}, got {type(message).__name__}"
@@ -55,7 +55,7 @@ def encode(topic: Topic[M], message: M) -> bytes:
 
 
 def _escaped(value: Any) -> Any:
-    r"""``value`` with characters outside UTF-8 escaped: undecodable bytes of a file's name as ``\xff``."""
+    r"""Escape characters outside UTF-8 in ``value``: undecodable bytes of a file's name become ``\xff``."""
     match value:
         case str():
             bytes_shown = _BYTE.sub(lambda byte: f"\\x{ord(byte[0]) - 0xDC00:02x}", value)
@@ -95,7 +95,7 @@ def encoding(topic: Topic[Any]) -> str:
 
 @cache
 def schema(topic: Topic[Any]) -> WireSchema:
-    """Schema of the topic, as MCAP and the schema queryable carry it."""
+    """Schema of the topic for MCAP and the schema queryable."""
     if topic.foxglove is None:
         text = json.dumps(_flat(topic.model.model_json_schema()), separators=(",", ":"))
         return WireSchema(topic.schema_name, "jsonschema", text.encode(), "json")
@@ -103,9 +103,9 @@ def schema(topic: Topic[Any]) -> WireSchema:
 
 
 def _flat(root: dict[str, Any]) -> dict[str, Any]:
-    """JSON Schema without references and unions, which viewers of logs do not read.
+    """JSON Schema without references and unions, which log viewers do not support.
 
-    An optional value is one that may be missing: ``encode`` writes no nulls.
+    An optional value may be missing: ``encode`` writes no nulls.
     """
     definitions = root.pop("$defs", {})
 

@@ -1,8 +1,8 @@
 """Our messages as the well-known ``foxglove.*`` protobuf messages, so that stock viewers draw them.
 
-Foxglove's published descriptors are extended by the fields of ``foxglove_fields.proto``, in a separate descriptor pool:
-the default pool holds the published ones under the same names. Bytes of version 0.1.0, which also has fields that are
-zero, and bytes of any other protobuf writer are read, too.
+The fields of ``foxglove_fields.proto`` extend Foxglove's published descriptors, in a separate descriptor pool, because
+the default pool contains the published ones under the same names. Bytes of version 0.1.0, which also writes zero
+fields, and of any other protobuf writer can be read, too.
 """
 
 import itertools
@@ -60,7 +60,7 @@ def descriptor_set(name: str) -> bytes:
 
 
 def _message_class(name: str, *, packed: bool) -> type[Any]:
-    """Class of ``name``; ``packed``: with each ``repeated double`` as the ``bytes`` that it is when packed."""
+    """Class of ``name``; ``packed``: with each ``repeated double`` replaced by ``bytes``, its packed form."""
     pool = DescriptorPool()
     for file in FileDescriptorSet.FromString(descriptor_set(name)).file:
         for field in itertools.chain.from_iterable(message.field for message in file.message_type if packed):
@@ -102,11 +102,11 @@ def _planar(pose: Any) -> tuple[float, float, float]:
 _Numbers = Sequence[float] | bytes
 """A field of type ``repeated double``, or its packed bytes."""
 _Fields = dict[str, Any]
-"""Values of one of our models, by name, not validated yet."""
+"""Values of one of our models by name, not yet validated."""
 
 
 _DOUBLES: Final = {count: struct.Struct(f"<{count}d") for count in (1, 3)}
-"""How so many numbers are packed."""
+"""Format of this many packed numbers."""
 
 
 def _bytes(numbers: _Numbers) -> bytes:
@@ -127,7 +127,7 @@ def _packed(*numbers: float) -> bytes:
 
 
 def _unpacked(numbers: _Numbers, count: int) -> tuple[float, ...]:
-    """So many numbers."""
+    """Check and return this many numbers."""
     data = _bytes(numbers)
     try:
         return _DOUBLES[count].unpack(data)
@@ -137,7 +137,7 @@ def _unpacked(numbers: _Numbers, count: int) -> tuple[float, ...]:
 
 
 def _pose2d(exact: _Numbers, pose: Any) -> Pose2D:
-    """Our exact (x, y, yaw) if the writer gave it, else the standard pose."""
+    """Our exact (x, y, yaw) if the writer included it, otherwise the standard pose."""
     x, y, yaw = _unpacked(exact, 3) if exact else _planar(pose)
     return Pose2D(x=x, y=y, yaw=yaw)
 
@@ -281,7 +281,7 @@ def _read_grid(proto: Any) -> _Fields:
 
 
 _GROUND: Final = ("tilt", "roughness")
-"""Layers of a ``Ground``: a byte each in every cell."""
+"""Layers of a ``Ground``: one byte each per cell."""
 
 
 def _write_ground(ground: Ground, proto: Any) -> None:
@@ -391,15 +391,17 @@ def _read_log(proto: Any) -> _Fields:
 
 @dataclass(frozen=True, slots=True)
 class _Binding:
-    """How one of our models travels as a well-known message."""
+    """Mapping of one of our models to a well-known message."""
 
     proto: type[Any]
     packed: type[Any]
-    """The same message with its numbers packed, see ``_message_class``."""
+    """The same message with packed numbers, see ``_message_class``."""
     write: Callable[[Any, Any], None]
-    """Fill the packed message from the model; raises ``InputError``."""
+    """Fills the packed message from the model; raises ``InputError``."""
     read: Callable[[Any], _Fields]
-    """Message, packed or not, to the model's fields; raises ``InputError`` or ``pydantic.ValidationError``."""
+    """Converts a message, packed or not, to the model's fields; raises ``InputError`` or
+    ``pydantic.ValidationError``.
+    """
 
 
 def _binding(name: str, write: Callable[[Any, Any], None], read: Callable[[Any], _Fields]) -> _Binding:
@@ -423,7 +425,7 @@ def encode(message: Message) -> bytes:
     """Serialize ``message``.
 
     Raises:
-        InputError: it contradicts itself.
+        InputError: the message is inconsistent.
     """
     binding = _BINDINGS[type(message)]
     proto = binding.packed()
@@ -442,7 +444,7 @@ def decode(model: type[M], data: bytes) -> M:
     binding = _BINDINGS[model]
     try:
         proto = binding.packed.FromString(data)
-        # Numbers that are not packed are unknown fields here; in several pieces they come from no writer of our fields.
+        # Numbers that are not packed are unknown fields here; no writer of our fields splits them.
         if not proto.received or len(UnknownFieldSet(proto)):
             proto = binding.proto.FromString(data)
     except DecodeError as error:

@@ -129,10 +129,10 @@ def test_roles_include_those_before_them():
     "endpoint", ["tcp/0.0.0.0:7447", "tcp/[::]:7447", "udp/192.168.1.5:7447", "ws/truck.local:80", "quic/0.0.0.0:1"]
 )
 def test_a_network_without_certificates_must_be_asked_for_by_name(endpoint):
-    with pytest.raises(ValidationError, match=r"anybody on the network could drive.*security init.*insecure: true"):
+    with pytest.raises(ValidationError, match=r"anyone on the network could drive.*security init.*insecure: true"):
         ZenohConfig(listen=("tcp/127.0.0.1:7447", endpoint))
     assert ZenohConfig(listen=(endpoint,), insecure=True).open_endpoints == (endpoint,)
-    with pytest.raises(ValidationError, match=r"anybody on the network could drive.*security init.*insecure: true"):
+    with pytest.raises(ValidationError, match=r"anyone on the network could drive.*security init.*insecure: true"):
         ZenohConfig(connect=(endpoint,))
     assert ZenohConfig(connect=(endpoint,), insecure=True).open_endpoints == (endpoint,)
 

@@ -54,7 +54,7 @@ def test_an_emergency_stop_is_refused_only_while_many_of_its_owner_are_carried_o
     limits: CallLimits, source: str | None
 ):
     assert taken(limits, "estop", source, 3 * ESTOPS.owner) == ESTOPS.owner
-    assert "are being carried out" in limits.refusal("estop", source, 0)
+    assert "are still in progress" in limits.refusal("estop", source, 0)
     assert limits.refusal("estop", "ann", 10 * CALLS.waiting) == ""
     limits.ended("estop", source)
     limits.ended("disarm", source)
@@ -68,7 +68,7 @@ def test_programs_of_one_owner_share_what_it_may_stop(limits: CallLimits):
 def test_emergency_stops_under_invented_names_are_bounded_together(limits: CallLimits):
     names = [f"eve{number}" for number in range(3 * ESTOPS.together)]
     assert [limits.refusal("estop", name, 0) for name in names].count("") == ESTOPS.together
-    assert f"{ESTOPS.together} emergency stops are being carried out" in limits.refusal("estop", "ann", 0)
+    assert f"{ESTOPS.together} emergency stops are still in progress" in limits.refusal("estop", "ann", 0)
     limits.ended("estop", names[0])
     assert limits.refusal("estop", "ann", 0) == ""
 

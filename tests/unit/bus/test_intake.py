@@ -305,7 +305,7 @@ async def test_wrong_shapes_are_refused_without_decoding_them(shape: str, monkey
     entrance.send((REQ_PATH, data))
     await entrance.settle()
     event = await entrance.events.next()
-    assert (event.reason, event.text) == (Reason.BAD_INPUT, "req/path: request of too many parts")
+    assert (event.reason, event.text) == (Reason.BAD_INPUT, "req/path: request in too many parts")
 
 
 async def test_what_cannot_be_an_array_is_refused_like_any_bad_input():
@@ -386,7 +386,7 @@ async def test_observers_order_an_emergency_stop_and_nothing_else():
     assert got == []
     event = await entrance.events.next()
     assert event.reason is Reason.NOT_PERMITTED
-    assert event.text == "req/control: bob has the role observer, this takes pilot"
+    assert event.text == "req/control: bob has the role observer, but this needs pilot"
     entrance.send((REQ_CONTROL, order(Order.ESTOP)), sender=bob)
     await entrance.settle()
     assert [(request.order, request.source) for request in got] == [(Order.ESTOP, "bob")]

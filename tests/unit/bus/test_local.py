@@ -34,20 +34,20 @@ def test_only_the_tables_writer_gets_the_write_end_and_only_once(bus: Bus):
     with pytest.raises(RuntimeError, match="written by estimation, not by planner"):
         bus.publisher(POSE, Writer.PLANNER)
     bus.publisher(POSE, Writer.ESTIMATION)
-    with pytest.raises(RuntimeError, match="already handed out"):
+    with pytest.raises(RuntimeError, match="already has a writer"):
         bus.publisher(POSE, Writer.ESTIMATION)
 
 
 @pytest.mark.parametrize("topic", [CMD_DRIVE, REQ_CONTROL, EVENT], ids=lambda t: t.name)
 def test_commands_requests_and_events_have_no_plain_write_end(bus: Bus, topic):
-    with pytest.raises(RuntimeError, match="no plain write end"):
+    with pytest.raises(RuntimeError, match="cannot be written directly"):
         bus.publisher(topic, topic.writer)
 
 
 def test_actuators_are_handed_out_exactly_once(bus: Bus):
     (drive, second), steering = bus.actuators(2)
     assert (drive.next_seq(), drive.next_seq(), second.next_seq(), steering.next_seq()) == (0, 1, 0, 0)
-    with pytest.raises(RuntimeError, match="already handed out"):
+    with pytest.raises(RuntimeError, match="already has a writer"):
         bus.actuators()
 
 

@@ -184,16 +184,16 @@ def test_a_router_is_made_by_a_command_and_every_name_is_there_once(tmp_path: Pa
             trusted = (folder.path / "stations" / name / "ca.pem").read_text()
             assert (tmp_path / "router/authority.pem").read_text() in trusted
     folders["crab"].add("hare", AccessRole.PILOT, Role.STATION, NOW)
-    with pytest.raises(InputError, match="hare: expected another name"):
+    with pytest.raises(InputError, match="hare: expected a different name"):
         make_router(tmp_path / "router", list(folders.values()), ("10.0.0.2",), NOW)
 
 
 def test_no_station_has_the_name_of_the_router_whichever_came_first(tmp_path: Path):
     folder = fleet(tmp_path)["crab"]
-    with pytest.raises(InputError, match="cy: is the fleet's router"):
+    with pytest.raises(InputError, match="cy: is the name of the fleet's router"):
         folder.join("cy", "tls/10.0.0.2:7447", folder.authority().pem)
     assert not (folder.path / "router.pem").exists()
     folder.join("router", "tls/10.0.0.2:7447", folder.authority().pem)
-    with pytest.raises(InputError, match="router: is the fleet's router"):
+    with pytest.raises(InputError, match="router: is the name of the fleet's router"):
         folder.add("router", AccessRole.PILOT, Role.STATION, NOW)
     assert folder.zenoh().tls.routers == ("router",), "the robot starts with what was written"

@@ -137,7 +137,7 @@ def test_a_caller_needs_the_role_of_the_call(needed: AccessRole, has: AccessRole
     success, data = run_virtual(main)
     assert success == has.covers(needed)
     if not success:
-        text = f"echo: bob has the role {has}, this takes {needed}"
+        text = f"echo: bob has the role {has}, but this needs {needed}"
         assert json.loads(data) == {"reason": "not_permitted", "text": text}
 
 

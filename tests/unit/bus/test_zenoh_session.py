@@ -392,7 +392,7 @@ async def test_calls_with_huge_payloads_are_refused_before_anybody_parses_them()
 
 async def test_an_endpoint_in_use_is_refused_by_name():
     async with running_robot() as robot:
-        by = rf"is in use by robot 'truck', process {os.getpid()} \(.*\); a second robot needs zenoh.listen of its own"
+        by = rf"is in use by robot 'truck', process {os.getpid()} \(.*\); give a second robot another zenoh.listen"
         with pytest.raises(BusyError, match=f"{robot.endpoint}.* {by}"):
             async with running_robot(robot.endpoint):
                 pass

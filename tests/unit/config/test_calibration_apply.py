@@ -58,7 +58,7 @@ def test_what_is_measured_of_a_part_that_has_another_name_now_is_not_silently_dr
     monkeypatch.setattr(sys, "argv", ["monstertruckd", "calibrate", "show", "--config", str(config)])
     with pytest.raises(SystemExit):
         main()
-    said = "not used, as the configuration has no such part: devices.sonar.driver.sonars.left.mount.x"
+    said = "ignored, because the configuration has no such part: devices.sonar.driver.sonars.left.mount.x"
     assert said in capsys.readouterr().err
 
 
@@ -107,7 +107,7 @@ def test_devices_that_are_not_there_are_left_out(config: Path):
 
 def test_a_value_that_does_not_fit_is_refused_by_file_and_key(config: Path):
     path = save(config, result("steering", devices__steering__driver__front__centre_us=900.0))
-    with pytest.raises(ConfigError, match=rf"{path}: devices\.steering\.driver\.front: min_us 1088"):
+    with pytest.raises(ConfigError, match=rf"{path}: devices\.steering\.driver\.front: expected min_us 1088"):
         load_truck(config)
 
 

@@ -188,7 +188,7 @@ def test_a_damaged_file_is_named_with_the_way_back(store: CalibrationStore):
 
 def test_another_trucks_file_is_refused(store: CalibrationStore):
     store.save(ratio(640.0), NOON)
-    with pytest.raises(ConfigError, match="calibration of 'truck', this is 'lorry'"):
+    with pytest.raises(ConfigError, match="calibration of 'truck', expected 'lorry'"):
         CalibrationStore(store.folder, "lorry").current()
 
 

@@ -69,8 +69,8 @@ def test_time_way_and_another_part_end_it():
     life = WIZARDS["drive"].lifetime
     assert state_of(saved, TRUCK, NOW, 1000.0).expired == ""
     assert state_of(saved, TRUCK, NOW, 1000.0).metres_left == life.metres
-    assert "counted until" in state_of(saved, TRUCK, NOW + (life.days + 1) * DAY, 1000.0).expired
-    assert "0.5 km farther" in state_of(saved, TRUCK, NOW, 1500.0 + life.metres).expired
+    assert "valid until" in state_of(saved, TRUCK, NOW + (life.days + 1) * DAY, 1000.0).expired
+    assert "exceeds its validity by 0.5 km" in state_of(saved, TRUCK, NOW, 1500.0 + life.metres).expired
     drive = TRUCK.devices.drive
     port = PortConfig(path=Path("/dev/other"))
     moved = TRUCK.model_copy(
@@ -154,7 +154,7 @@ def test_an_odometer_that_cannot_be_written_is_reported_by_its_cause(code, reaso
     run_virtual(main)
     ((found, text),) = events
     assert found is reason
-    assert text.endswith(f"the distance driven is not saved: {os.strerror(code)}")
+    assert text.endswith(f"the distance driven cannot be saved: {os.strerror(code)}")
 
 
 def test_a_value_of_zero_has_the_worst_grade_where_its_interval_is_meant_as_a_share_of_it():

@@ -106,7 +106,7 @@ def test_who_makes_the_robot_less_safe_than_by_default_is_warned(
     settings.set_value("gate.tilt.stop", "0.4")
     said = capsys.readouterr()
     assert said.out == "gate.tilt.stop is 0.4 until the daemon ends\n"
-    assert "less safe than by default: gate.tilt.stop 0.4, default 0.35" in said.err
+    assert "less safe than the default: gate.tilt.stop 0.4, default 0.35" in said.err
     assert robot.set({"gate.speed": 0.1, "gate.reverse_speed": 0.1})["weakened"] == [], "only what is new"
 
 

@@ -88,7 +88,7 @@ def test_an_upgrade_that_broke_off_can_be_repeated(old: Path):
 
 def test_a_previous_file_of_another_content_is_not_lost(old: Path):
     (old.parent / "old.yaml.v0").write_text("precious")
-    with pytest.raises(InputError, match=r"old\.yaml\.v0: holds another version 0"):
+    with pytest.raises(InputError, match=r"old\.yaml\.v0: already contains another version 0"):
         carry_out(plan(old, STEPS, 2))
     assert old.read_text() == OLD
 
@@ -96,7 +96,7 @@ def test_a_previous_file_of_another_content_is_not_lost(old: Path):
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("version: 3\n", r"a\.yaml:1: version: 3 is newer than this program, which knows up to 2"),
+        ("version: 3\n", r"a\.yaml:1: version: 3 is newer than this program, which supports up to 2"),
         ("robot: x\n", r"a\.yaml:1: version: expected 0 to 2, found None"),
         ("\nversion: one\n", r"a\.yaml:2: version: expected 0 to 2, found one"),
         ("version: {\n", r"a\.yaml:2: not valid YAML"),
@@ -113,7 +113,7 @@ def test_what_cannot_be_upgraded_is_said(text: str, complaint: str, tmp_path: Pa
 
 
 def test_a_hole_in_the_chain_is_said(old: Path):
-    with pytest.raises(ConfigError, match="no way from version 1 to 2"):
+    with pytest.raises(ConfigError, match="cannot be migrated from version 1 to 2"):
         plan(old, {0: _to_robot}, 2)
 
 

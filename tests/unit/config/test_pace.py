@@ -63,5 +63,5 @@ def test_the_comparison_of_sensors_ends_at_its_speed():
     believes = OdometryConfig(max_speed=10.0)
     assert list(too_slow(4.0, believes, None, None, None, consistent=True)) == []
     (text,) = too_slow(4.1, believes, None, None, None, consistent=True)
-    assert text.startswith("gate.speed 4.1 m/s: at most 4, up to which the sensors are compared")
+    assert text.startswith("gate.speed 4.1 m/s: at most 4, the limit for the comparison of sensors")
     assert list(too_slow(4.1, believes, None, None, None, consistent=False)) == []

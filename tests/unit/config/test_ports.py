@@ -83,13 +83,13 @@ def test_motor_controllers_and_cameras_are_refused_on_the_network(tmp_path: Path
 
 def test_no_two_devices_share_an_address(tmp_path: Path):
     port = "{address: 192.168.0.10, tcp: 10940}"
-    with pytest.raises(ConfigError, match=r"lidar and compass share the port 192\.168\.0\.10:10940"):
+    with pytest.raises(ConfigError, match=r"lidar and compass have the same port 192\.168\.0\.10:10940"):
         truck(tmp_path, lidar(port) + f"  compass: {{port: {port}, driver: {{kind: os4000}}}}\n")
 
 
 def test_no_two_devices_share_a_port(tmp_path: Path):
     two = lidar('{hub: "1-1", port: 3}') + '  compass: {port: {hub: "1-1", port: 3}, driver: {kind: os4000}}\n'
-    with pytest.raises(ConfigError, match="lidar and compass share the port hub 1-1 port 3"):
+    with pytest.raises(ConfigError, match="lidar and compass have the same port hub 1-1 port 3"):
         truck(tmp_path, two)
 
 
@@ -126,5 +126,5 @@ def test_a_program_is_a_camera_only(tmp_path: Path):
     assert config.devices.camera.port.label == "rpicam-vid -o -"
     assert real_ports(config) == ("camera",)
     for role, kind in (("drive", "epos"), ("camera", "webcam"), ("lidar", "ld19")):
-        with pytest.raises(ConfigError, match=f"{role}: only a camera of kind mjpeg is a program's output"):
+        with pytest.raises(ConfigError, match=f"{role}: only a camera of kind mjpeg may read the output of a program"):
             truck(tmp_path, at % (role, kind))

@@ -51,18 +51,18 @@ def test_a_link_is_where_it_leads(tmp_path: Path):
 @pytest.mark.parametrize(
     ("text", "lines"),
     [
-        ("include: [{0}/truck.yaml, {0}/demo.yaml]", ["{0}/demo.yaml:20: sim: a simulation mixed with the real port"]),
+        ("include: [{0}/truck.yaml, {0}/demo.yaml]", ["{0}/demo.yaml:20: sim: a simulation cannot use the real port"]),
         (
             "include: [{0}/slam.yaml, {0}/truck.yaml]",
-            ["{0}/slam.yaml:10: sim: a simulation mixed", "{0}/slam.yaml:6: stand: a simulation mixed"],
+            ["{0}/slam.yaml:10: sim: a simulation cannot", "{0}/slam.yaml:6: stand: a simulation cannot"],
         ),
-        ("include: {0}/truck.yaml\nstand: simulator", ["{1}:2: stand: a simulation mixed with the real port"]),
-        ("include: {0}/truck.yaml\nsim: {{seed: 2}}", ["{1}:2: sim: a simulation mixed with the real port"]),
+        ("include: {0}/truck.yaml\nstand: simulator", ["{1}:2: stand: a simulation cannot use the real port"]),
+        ("include: {0}/truck.yaml\nsim: {{seed: 2}}", ["{1}:2: sim: a simulation cannot use the real port"]),
         (
             "include: {0}/demo.yaml\ndevices:\n  drive:\n    port: {{path: /dev/truck/drive}}",
-            ["{0}/demo.yaml:20: sim: a simulation mixed with the real port devices.drive.port ({1}:4)"],
+            ["{0}/demo.yaml:20: sim: a simulation cannot use the real port devices.drive.port ({1}:4)"],
         ),
-        ("include: {0}/full.yaml\nmachine: /", ["{0}/full.yaml:30: sim: a simulation mixed with the real port"]),
+        ("include: {0}/full.yaml\nmachine: /", ["{0}/full.yaml:30: sim: a simulation cannot use the real port"]),
     ],
 )
 def test_a_simulation_with_real_ports_is_refused_by_file_and_line(text: str, lines: list[str], tmp_path: Path):

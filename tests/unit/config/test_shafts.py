@@ -53,7 +53,7 @@ def test_a_side_each_takes_two_motors():
         ),
         (
             {"devices__drive_3": {"port": {"path": "/dev/x"}, "driver": {"kind": "epos"}}},
-            "both publish sensor/drive_3; a topic has one writer",
+            "both publish sensor/drive_3; expected one writer for each topic",
         ),
         (
             {
@@ -62,7 +62,7 @@ def test_a_side_each_takes_two_motors():
                     "driver": {"kind": "maestro", "front_right": {"channel": 2}, "rear_right": {"channel": 3}},
                 }
             },
-            "body skid_steer steers nothing: expected front_right and rear_right of devices.steering null",
+            "body skid_steer has no steering: expected front_right and rear_right of devices.steering null",
         ),
     ],
 )
@@ -74,5 +74,5 @@ def test_what_does_not_go_together_is_refused(changes: dict[str, Any], said: str
 
 def test_what_the_robot_cannot_notice_is_said():
     texts = stand().weakened()
-    assert any("steppers report the steps commanded" in text for text in texts)
+    assert any("steppers report the commanded steps" in text for text in texts)
     assert any(text.startswith("devices: no range sensor") for text in texts)

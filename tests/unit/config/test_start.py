@@ -114,7 +114,7 @@ def test_a_start_that_dies_before_the_stop_is_stored_leaves_the_file_to_the_next
     assert [one.file for one in left_out] == [file]
     assert started(*loaded)[2] == left_out
     (kept,) = aside(left_out, stored=False)
-    assert kept.text.endswith("; the file stays until the stop can be stored")
+    assert kept.text.endswith("; the file remains until the stop can be stored")
     assert started(*loaded)[2] == left_out
     aside(left_out)
     assert started(*loaded)[2] == ()
@@ -133,7 +133,7 @@ def test_without_any_sound_calibration_the_robot_is_as_configured(loaded, tmp_pa
 def test_the_calibration_of_another_truck_is_a_mistake_not_damage(loaded, tmp_path):
     path = saved(tmp_path / "calibration")
     KINDS["of another truck"](path)
-    with pytest.raises(ConfigError, match="is the calibration of 'lorry'"):
+    with pytest.raises(ConfigError, match="calibration of 'lorry'"):
         started(*loaded)
     assert path.exists()
 

@@ -1,4 +1,4 @@
-"""The page of symptoms knows every reason, once."""
+"""The page of symptoms lists every reason once, with a remedy."""
 
 import sys
 from pathlib import Path
@@ -17,4 +17,5 @@ def test_every_reason_that_is_no_success_has_its_symptom():
     named = [name for symptom in symptoms.SYMPTOMS for name in symptom.reasons]
     assert len(named) == len(set(named))
     assert set(named) == {reason.value for reason in Reason if reason.exit_code}
+    assert not [name for symptom in symptoms.SYMPTOMS for name, remedy in symptom.reasons.items() if not remedy]
     assert "what-to-do.md" in symptoms.page().uri

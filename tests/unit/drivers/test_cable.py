@@ -41,7 +41,7 @@ def test_a_port_that_another_program_serves_is_busy_until_it_ends(tmp_path: Path
 def test_what_is_no_link_keeps_its_name(tmp_path: Path):
     file = tmp_path / "notes"
     file.write_text("precious")
-    with pytest.raises(InputError, match="notes: is there already, and no link"), reserved(file):
+    with pytest.raises(InputError, match="notes: already exists and is not a link"), reserved(file):
         pass
     assert file.read_text() == "precious"
 

@@ -84,7 +84,10 @@ devices:
 @pytest.mark.parametrize(
     ("line", "complaint"),
     [
-        ("horn: { port: { path: /dev/x }, driver: { kind: os4000 } }", ":4: devices.horn: unknown key; known here: "),
+        (
+            "horn: { port: { path: /dev/x }, driver: { kind: os4000 } }",
+            ":4: devices.horn: unknown key; expected one of ",
+        ),
         ("compas: { port: { path: /dev/x }, driver: { kind: os4000 } }", "unknown key (did you mean compass?)"),
         ("compass: { port: { path: /dev/x }, driver: { kind: epos } }", ":4: devices.compass.driver.kind: "),
     ],
@@ -114,8 +117,8 @@ RADAR = RoleSpec(name="radar", duty=Duty.SENSOR, doc="A distance", writes={"out"
     ("role", "fault"),
     [
         (RADAR, None),
-        (dataclasses.replace(LIDAR, doc="another"), "role lidar: another role has this name"),
-        (dataclasses.replace(RADAR, name="so nar"), "expected a name of small letters"),
+        (dataclasses.replace(LIDAR, doc="another"), "role lidar: another role has the same name"),
+        (dataclasses.replace(RADAR, name="so nar"), "expected a name of lower-case letters"),
         (dataclasses.replace(RADAR, writes={"out": topics.POSE}), "drivers do not write state/pose"),
         (
             dataclasses.replace(RADAR, writes={"out": dataclasses.replace(topics.COMPASS, name="sensor/radar")}),
@@ -169,11 +172,11 @@ def test_what_a_section_has_besides_its_roles_is_reserved(section: type[Schema])
     ("changes", "complaint"),
     [
         ({"roles": ()}, "at least one role"),
-        ({"name": "present"}, "another meaning"),
-        ({"name": "model_config"}, "another meaning"),
-        ({"name": "_x"}, "small letters"),
-        ({"name": "gate"}, "another meaning"),
-        ({"duty": Duty.ACTUATOR}, "actuators are this repository's alone"),
+        ({"name": "present"}, "the name is reserved"),
+        ({"name": "model_config"}, "the name is reserved"),
+        ({"name": "_x"}, "lower-case letters"),
+        ({"name": "gate"}, "the name is reserved"),
+        ({"duty": Duty.ACTUATOR}, "only this repository may define actuators"),
     ],
 )
 def test_a_role_that_would_harm_the_daemon_is_refused(changes, complaint):
@@ -218,7 +221,9 @@ def test_a_kind_says_what_its_parts_should_be():
     kind = dataclasses.replace(DEVICES["ld19"], emulator=f"{__name__}:no_emulator", identity=f"{__name__}:no_facts")
     with pytest.raises(InputError, match=r"kind ld19: \S+: expected an emulator, found dict without name, run, power"):
         kind.emulated(EmulatorSetup("lidar", None, None, None))
-    with pytest.raises(InputError, match=r"kind ld19: \S+: range: expected a value for JSON, found array"):
+    with pytest.raises(
+        InputError, match=r"kind ld19: \S+: range: expected a value that JSON can represent, found array"
+    ):
         asyncio.run(dataclasses.replace(kind, opens="computer").identify(None, None))
 
 

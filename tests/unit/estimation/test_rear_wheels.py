@@ -89,7 +89,9 @@ def test_a_driven_wheel_that_slips_leaves_the_pose_alone_and_is_named():
 
 
 @pytest.mark.parametrize("side", [0, 1], ids=["left", "right"])
-@pytest.mark.parametrize(("share", "said"), [(0.0, "is stuck"), (-1.0, "counts the wrong way"), (0.6, "rolls 0.")])
+@pytest.mark.parametrize(
+    ("share", "said"), [(0.0, "is stuck"), (-1.0, "counts in the wrong direction"), (0.6, "rolls 0.")]
+)
 def test_one_bad_encoder_is_named_taken_back_and_the_other_one_goes_on(side, share, said):
     truck = Tricycle()
     truck.drive(0.2, 0.2, 2.0)
@@ -98,7 +100,7 @@ def test_one_bad_encoder_is_named_taken_back_and_the_other_one_goes_on(side, sha
     ((reason, text),) = truck.events
     assert reason is Reason.ENCODERS_DISAGREE
     assert f"{('left', 'right')[side]} {said}" in text
-    assert f"{('right', 'left')[side]} and steering carry on" in text
+    assert f"odometry uses {('right', 'left')[side]} and steering" in text
     assert truck.is_near(0.03, 0.03)
     assert truck.sources[0] == "encoders"
     truck.share[side] = 1.0
@@ -119,7 +121,7 @@ def test_without_both_the_drive_carries_on(shares, said):
     ((reason, text),) = truck.events
     assert reason is Reason.ENCODERS_DISAGREE
     assert said in text
-    assert "the drive carries on" in text
+    assert "odometry uses the drive" in text
     assert truck.is_near(0.04, 0.04)
     assert truck.sources == ("drive", "steering") or truck.sources == ("drive",)
 

@@ -106,7 +106,7 @@ def test_unknown_frames_are_named():
 
 def test_only_trees_are_accepted():
     frames = tree()
-    with pytest.raises(InputError, match="'lidar' hangs on 'base'"):
+    with pytest.raises(InputError, match="'lidar' already has the parent 'base'"):
         frames.put(mount("lidar", (0, 0, 0), parent="odom"))
     with pytest.raises(InputError, match="loop"):
         frames.put(mount("map", (0, 0, 0), parent="lidar"))

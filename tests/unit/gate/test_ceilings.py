@@ -60,9 +60,9 @@ def test_the_defaults_are_within_all_ceilings_and_weaken_nothing():
 @pytest.mark.parametrize(
     ("config", "expected"),
     [
-        ({"speed": 0.23}, "gate.speed 0.23 m/s: at most 0.220, the speed at the motor's greatest rate"),
+        ({"speed": 0.23}, "gate.speed 0.23 m/s: at most 0.220, the speed at the motor's maximum rate"),
         ({"reverse_speed": 0.22}, "gate.reverse_speed 0.22 m/s: at most gate.speed, 0.21"),
-        ({"acceleration": 3.5}, "gate.acceleration 3.5 m/s^2: at most 3.45, what 25 N"),
+        ({"acceleration": 3.5}, "gate.acceleration 3.5 m/s^2: at most 3.45, the acceleration by 25 N"),
         ({"deceleration": 3.5, "quick_deceleration": 3.5}, "gate.deceleration 3.5 m/s^2: at most 3.45"),
         ({"quick_deceleration": 3.5}, "gate.quick_deceleration 3.5 m/s^2: at most 3.45"),
         ({"scan": {"stale_after": 2.3}}, "gate.scan.stale_after 2.3 s: at most 2.24 s"),
@@ -117,7 +117,7 @@ def test_a_fast_truck_must_stop_within_what_its_lidar_sees():
     assert stopping_distance(GateConfig(**fast)) == pytest.approx(0.05 + 2.0 * (0.25 + 0.4 + 0.08) + 2.0)
     assert refusals(STRONG, **fast) == []
     (refusal,) = refusals(STRONG, **(fast | {"speed": 2.2}))
-    assert "stands after 4.08 m: at most 3.90 m, what the lidar is sure to see" in refusal
+    assert "stops within 4.08 m: at most 3.90 m, the lidar's reliable range" in refusal
     blind = BodyLimits(length=2.0, mass=10.0, pull=500.0, motor_speed=9.0, sight=None)
     (refusal,) = refusals(blind, **fast)
     assert "at most 2.00 m, its own length, as it has no lidar" in refusal
@@ -209,7 +209,7 @@ def test_sensors_checks_and_services_that_are_switched_off_are_named():
         "gate.turning null: servos without supply are not noticed",
         "gate.blocked null: a blocked shaft is not noticed",
         "gate.runaway null: a motor that does not obey is not noticed",
-        "gate.obstacle.open_ground true: a scan without any range counts as free ground",
+        "gate.obstacle.open_ground true: a scan without any range is treated as free ground",
         "gate.tolerated_failures: slam may fail while the robot drives",
         "gate.remote_trackers: desk may drive from outside",
     )

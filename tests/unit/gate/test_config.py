@@ -92,7 +92,11 @@ def test_every_driving_role_has_its_own_lease():
             "standstill 0.021 m/s: expected at most obstacle.crawl, 0.02 m/s",
         ),
         ({"obstacle": {"crawl": 0.209}}, {"obstacle": {"crawl": 0.21}}, "crawl 0.21 m/s: expected less than speed"),
-        ({"short_faults_within": 4.0}, {"short_faults_within": 3.9}, "short_faults_within 3.9 s: expected a second"),
+        (
+            {"short_faults_within": 4.0},
+            {"short_faults_within": 3.9},
+            "short_faults_within 3.9 s: expected at least one second",
+        ),
         (
             {"leases": {"tracker": 0.9}, "disarm_after": 0.91},
             {"leases": {"tracker": 0.9}, "disarm_after": 0.9},

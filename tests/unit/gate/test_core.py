@@ -84,7 +84,7 @@ def test_a_body_says_which_requests_it_takes(monkeypatch):
     monkeypatch.setattr(type(robot.chassis), "forms", frozenset({DriveForm.TWIST}))
     assert robot.drive(speed=0.1) is Reason.IMPOSSIBLE_MOTION
     robot.tick()
-    assert newest(robot).text == "a request by axles: this body takes twist"
+    assert newest(robot).text == "a request by axles: this body accepts twist"
 
 
 def test_a_request_of_a_truck_that_is_not_armed_is_refused_for_its_mode():

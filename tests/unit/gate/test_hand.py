@@ -44,10 +44,10 @@ def test_off_stops_and_disarms_whoever_has_armed_and_again_until_it_stands(mode)
 @pytest.mark.parametrize(
     ("seen", "why"),
     [
-        (None, "nothing heard"),
+        (None, "no data from the receiver"),
         (controls(0, arm=True), "silent for more than 0.25 s"),
-        (controls(SECOND, arm=True, lost=True), "does not hear its transmitter"),
-        (controls(SECOND, arm=True, link_quality=0.2), "link quality 20%, at least 30% is needed"),
+        (controls(SECOND, arm=True, lost=True), "has lost the transmitter"),
+        (controls(SECOND, arm=True, link_quality=0.2), "link quality 20%: at least 30% is needed"),
     ],
 )
 def test_the_loss_of_the_transmitter_is_a_stop_and_the_switch_must_be_seen_off_again(seen, why):

@@ -171,7 +171,7 @@ def test_who_does_not_know_of_anothers_stop_starts_nothing(stop):
     rig.tick()
     assert rig.order(start, source="ann", gate_stamp=known) is Reason.BAD_SEQUENCE
     rig.tick()
-    assert rig.events[-1].text == "bob has ordered a stop meanwhile"
+    assert rig.events[-1].text == "bob has ordered a stop in the meantime"
     assert rig.order(start, source="bob", gate_stamp=known) is Reason.OK, "its own orders have their sequence"
     assert rig.order(stop, source="bob") is Reason.OK
     assert rig.order(start, source="ann", gate_stamp=rig.now) is Reason.OK
@@ -205,7 +205,7 @@ def test_who_stops_twice_has_to_know_of_the_other_stop_alone():
     rig.tick()
     assert rig.order(Order.ARM, source="bob", gate_stamp=before) is Reason.BAD_SEQUENCE
     rig.tick()
-    assert rig.events[-1].text == "ann has ordered a stop meanwhile"
+    assert rig.events[-1].text == "ann has ordered a stop in the meantime"
     assert rig.order(Order.ARM, source="bob", gate_stamp=between) is Reason.OK
 
 

@@ -106,7 +106,7 @@ def test_an_order_to_stop_a_truck_that_still_moves_is_not_done_and_says_so_after
         bench.speed = 0.15
         began = bench.clock.now()
         await bench.clock.sleep(0.1)
-        with pytest.raises(NoAnswerError, match=r"not confirmed after 4 s: .*a motor turns without an order"):
+        with pytest.raises(NoAnswerError, match=r"not confirmed after 4 s: .*a motor turns without a command"):
             await bench.call(order)
         assert bench.clock.now() - began >= 4 * SECOND
         state = bench.states.latest

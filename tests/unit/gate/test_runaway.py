@@ -399,7 +399,7 @@ def test_a_body_that_moves_while_its_drive_reads_standstill_is_found(speed, wz):
     rig.tick(30)
     assert moved(rig, speed, wz) <= 0.5
     text = rig.reported(Reason.UNCOMMANDED_MOTION)[0].text
-    assert "stands by its own measure" in text
+    assert "reports standstill while" in text
     assert text.endswith("power stage off"), "a drive that reads standstill cannot confirm a quick stop"
 
 
@@ -491,7 +491,7 @@ def test_motion_that_the_scans_alone_show_is_found_if_a_motor_may_make_it(distan
     assert bool(events) is (current > 0)
     assert (rig.out.mode is GateMode.ESTOPPED) is (current > 0)
     if current:
-        assert events[0].text.startswith("lidar stands by its own measure while the body moves")
+        assert events[0].text.startswith("lidar reports standstill while the body moves")
 
 
 def test_short_motions_of_the_scans_that_follow_each_other_count_together():
@@ -639,7 +639,7 @@ def test_a_joint_that_strays_keeps_the_robot_from_being_armed_until_an_operator_
         rig.gate.observe(message, topics.STABILISER)
         rig.tick()
     event = rig.reported(Reason.UNCOMMANDED_MOTION)[-1]
-    assert event.text == "stabiliser turned away from its goal by itself; quick stop"
+    assert event.text == "stabiliser moved away from its target by itself; quick stop"
     assert rig.out.action is DriveAction.QUICK_STOP
     assert rig.out.mode is GateMode.ESTOPPED
     assert rig.order(Order.ARM) is Reason.ESTOPPED

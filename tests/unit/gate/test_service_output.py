@@ -163,7 +163,7 @@ def test_settings_that_weaken_are_reported_at_the_start_and_in_every_state(caplo
         assert [(reason, text) for reason, _, text, _ in bench.events] == [(Reason.WEAKENED, each) for each in weak]
         assert bench.out.state.last.weakened == weak
         logged = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-        assert logged == [f"configured less safe than by default: {each}" for each in weak]
+        assert logged == [f"configured less safely than by default: {each}" for each in weak]
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
 

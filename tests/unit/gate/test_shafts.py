@@ -51,7 +51,7 @@ def test_shafts_that_push_against_each_other_are_refused():
     assert robot.roll(1.0, -1.0, -1.0, 1.0) is Reason.OK, "sideways"
     assert robot.roll(1.0, 1.0, -1.0, -1.0) is Reason.IMPOSSIBLE_MOTION
     robot.tick()
-    assert "push against each other" in robot.reported(Reason.IMPOSSIBLE_MOTION)[0].text
+    assert "work against each other" in robot.reported(Reason.IMPOSSIBLE_MOTION)[0].text
 
 
 def test_wheels_of_one_side_may_differ_a_little_and_each_turns_as_asked():

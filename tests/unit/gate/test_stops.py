@@ -351,6 +351,6 @@ def test_a_story_counts_from_now_and_its_causes_from_the_stop():
     assert stop_lines(stop, 310 * SECOND) == [
         "quick stop at 0.12 m/s 5 min ago, driver ann",
         "no fresh lidar scan (for 20 ms, age unknown, limit 250 ms)",
-        "  because device unplugged or its port vanished (for 2.0 s, volts 4.12 V, 50 ms old)",
+        "  because device unplugged or its port disappeared (for 2.0 s, volts 4.12 V, 50 ms old)",
         "black box blackbox-000001-scan_stale.mcap",
     ]

@@ -46,7 +46,7 @@ def test_bodies_that_can_move_sideways(kind, side):
         ("ackermann", SIDE, "this body cannot move sideways"),
         ("ackermann", {"vx": 0.2, "vy": 0.1}, "vy is 0.1: more than the 0 of its turn"),
         ("differential", SIDE, "this body cannot move sideways"),
-        ("synchro", SPOT, "wz is 0.5: expected 0, this body keeps its heading"),
+        ("synchro", SPOT, "wz is 0.5: expected 0, because this body keeps its heading"),
         ("synchro", SIDE, "this body cannot move sideways"),
     ],
 )
@@ -64,7 +64,7 @@ def test_a_form_that_a_body_does_not_take_is_refused(monkeypatch):
     monkeypatch.setattr(type(robot.chassis), "forms", frozenset({"axles"}))
     assert robot.twist(vx=0.1) is Reason.IMPOSSIBLE_MOTION
     robot.tick()
-    assert "a request by twist: this body takes axles" in robot.reported(Reason.IMPOSSIBLE_MOTION)[0].text
+    assert "a request by twist: this body accepts axles" in robot.reported(Reason.IMPOSSIBLE_MOTION)[0].text
     assert robot.drive(speed=0.1) is Reason.OK
 
 

@@ -82,7 +82,9 @@ def test_a_pose_that_jumps_into_a_zone_stops_the_truck_and_going_on_takes_turnin
     assert rig.out.mode is GateMode.STOPPING
     rig.tick(100)
     assert rig.speed == 0.0
-    assert "in the keepout zone stairs: `monstertruckd zone off stairs` to drive out of it" in rig.trips[-1].text
+    assert (
+        "in the keepout zone stairs: switch it off (`monstertruckd zone off stairs`) to drive out" in rig.trips[-1].text
+    )
     assert rig.reported(Reason.KEEPOUT)
     rig.driver = None
     rig.order(Order.DISARM)
@@ -165,7 +167,7 @@ def test_a_robot_that_does_not_know_its_place_or_its_zones_stands():
     rig.gate.observe(nowhere, topics.SLAM)
     rig.tick(40)
     assert rig.speed == 0.0
-    assert "its place on the saved map is not known" in check_of(rig.gate, ZoneCheck).text(Reason.KEEPOUT)
+    assert "its pose on the saved map is unknown" in check_of(rig.gate, ZoneCheck).text(Reason.KEEPOUT)
 
 
 def test_the_speed_before_a_limit_is_one_from_which_it_is_reached_in_time():

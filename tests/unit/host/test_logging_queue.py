@@ -59,7 +59,7 @@ def test_a_stuck_reader_costs_records_not_time(clean_root: logging.Logger):
     listener.stop()
     assert "WARNING x: 0\n" in stream.getvalue()
     assert f": {LOG_QUEUE + 499}\n" not in stream.getvalue()
-    assert f"{handler.lost} records lost: this output was stuck\n" in stream.getvalue()
+    assert f"{handler.lost} records lost: this output was blocked\n" in stream.getvalue()
 
 
 def test_levels(clean_root: logging.Logger):

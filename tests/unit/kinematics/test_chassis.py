@@ -157,7 +157,7 @@ def test_mecanum_wheels_crab():
         ("ackermann", 0.2, 0.1, r"rear is 0\.1: expected 0"),
         ("differential", 0.2, 0.2, "cannot move sideways"),
         ("skid-steer", 0.2, -0.2, r"rear is -0\.2"),
-        ("synchro", 0.2, 0.0, "expected equal angles, this body keeps its heading"),
+        ("synchro", 0.2, 0.0, "expected equal angles, because this body keeps its heading"),
     ],
 )
 def test_what_a_body_cannot_do_is_refused_with_the_reason(body, front, rear, why):

@@ -100,14 +100,14 @@ def test_moments_of_inertia():
 @pytest.mark.parametrize(
     ("links", "joints", "text"),
     [
-        ((Part("a"), Part("a")), (), "used twice"),
+        ((Part("a"), Part("a")), (), "have the same name"),
         ((Part("a"), Part("b")), (), "no joint leads to"),
-        ((Part("a"), Part("b")), (PartJoint("j", "fixed", "c", "b"),), "joint j: expected a parent before it"),
-        ((Part("a"),), (PartJoint("j", "fixed", "a", "b"),), "joint j: expected a parent before it"),
+        ((Part("a"), Part("b")), (PartJoint("j", "fixed", "c", "b"),), "joint j: expected a parent defined before it"),
+        ((Part("a"),), (PartJoint("j", "fixed", "a", "b"),), "joint j: expected a parent defined before it"),
         (
             (Part("a"), Part("b")),
             (PartJoint("i", "fixed", "a", "b"), PartJoint("j", "fixed", "a", "b")),
-            "joint j: expected a parent before it",
+            "joint j: expected a parent defined before it",
         ),
     ],
 )

@@ -500,7 +500,7 @@ def test_a_disk_that_hangs_does_not_hold_up_the_end(tmp_path: Path, caplog):
         assert (clock.now() - ended) / SECOND == pytest.approx(module.LAST_SECONDS, abs=0.01)
 
     run_virtual(main)
-    assert "takes longer than 5 s" in caplog.text
+    assert "took longer than 5 s" in caplog.text
 
 
 def test_a_box_that_is_given_up_leaves_nothing_behind(tmp_path: Path):

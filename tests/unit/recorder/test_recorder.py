@@ -349,7 +349,7 @@ def test_a_file_that_is_removed_while_it_is_written_is_noticed_and_followed_by_a
     (path,) = logs(config)
     assert path.name == "run-000001-001.mcap"
     assert len(list(open_log(path))) > 300
-    assert f"{first} was removed while it was written: what it held is lost" in caplog.messages
+    assert f"{first} was removed while it was being written: its content is lost" in caplog.messages
     assert failures == []
 
 

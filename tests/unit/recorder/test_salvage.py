@@ -87,7 +87,7 @@ def test_the_case_of_the_hole(tmp_path):
     assert (done.messages, done.lost, done.counted) == (240, 160, True)
     assert len(read(file)) == 240
     assert str(done) == (
-        f"{file}: 240 messages kept, 160 lost (0.8 to 1.6 s after its begin); it cannot be read in 1 place, "
+        f"{file}: 240 messages kept, 160 lost (0.8 to 1.6 s after its start); it cannot be read in 1 place, "
         f"holds 240 of 400 messages; the original is {file}.damaged"
     )
     assert Path(f"{file}.damaged").read_bytes() == ZEROS.read_bytes()
@@ -128,7 +128,7 @@ def test_the_repair_of_a_start_keeps_the_original_and_says_what_is_lost(tmp_path
     assert (tmp_path / "run-000001-000.mcap.damaged").exists()
     (record,) = caplog.records
     assert record.levelname == "WARNING"
-    assert "140 messages kept, at least 20 lost (2.9 to 4.0 s, from 7.9 s on after its begin)" in record.getMessage()
+    assert "140 messages kept, at least 20 lost (2.9 to 4.0 s, from 7.9 s on after its start)" in record.getMessage()
     assert recover_directory(tmp_path) == []
 
 
@@ -150,7 +150,7 @@ def test_a_chunk_that_is_there_twice_is_kept_once(tmp_path, logs):
     assert [(one.topic, one.payload) for one in reader] == [
         (topic, data) for _, rows in log.chunks for topic, _, data in rows
     ]
-    assert reader.fault == "has a damaged index, holds 1 chunk twice"
+    assert reader.fault == "has a damaged index, contains 1 chunk twice"
     done = recover(file, file)
     assert read(file) == [row for _, rows in log.chunks for row in rows]
     assert done.repeated == 1
@@ -235,7 +235,7 @@ def bomb(compression: str, size: int, says: int) -> bytes:
     ("says", "text"),
     [
         (300_000_000, "a chunk of 300 MB: expected at most 128 MB"),
-        (1000, "a chunk of more than the 1000 bytes it says"),
+        (1000, "a chunk of more than the 1000 bytes in its header"),
     ],
 )
 def test_a_chunk_is_bounded_before_it_is_unpacked(tmp_path, compression, says, text):

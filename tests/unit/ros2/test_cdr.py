@@ -165,7 +165,7 @@ def test_a_mistake_of_ours_is_noticed(message, match):
 
 
 def test_other_byte_orders_are_refused_by_name():
-    with pytest.raises(InputError, match="little endian, found 00000000"):
+    with pytest.raises(InputError, match="little-endian CDR, found 00000000"):
         decode("std_msgs/msg/String", bytes(8))
 
 

@@ -122,8 +122,8 @@ def test_an_estimate_in_map_localises_alone_and_a_silent_estimator_leaves_the_tr
     [
         ({"frame": "world"}, "frame 'world': expected map or odom"),
         ({"child": "imu"}, "frame 'imu': expected base_link or base_footprint"),
-        ({"ago": 5.0}, "its header's stamp is not one of the last 2 s, in which the robot's odometry is known"),
-        ({"ago": -1.0}, "its header's stamp is not one of the last 2 s, in which the robot's odometry is known"),
+        ({"ago": 5.0}, "its header's stamp is older than 2 s, for which the robot's odometry is kept"),
+        ({"ago": -1.0}, "its header's stamp is older than 2 s, for which the robot's odometry is kept"),
     ],
 )
 def test_an_estimate_that_cannot_be_placed_is_refused(fields, text):
@@ -145,7 +145,7 @@ async def test_a_latched_map_of_ros_2_is_sent_to_the_robot_which_publishes_none(
         turned = info | {"origin": origin | {"orientation": {"z": 1.0}}}
         publish({"header": {"frame_id": "map"}, "info": turned, "data": np.zeros(6, np.int8)})
         await found.until(lambda: len(found.texts) == 2)
-        assert "turned by 3.142 rad" in found.texts[1]
+        assert "rotated by 3.142 rad" in found.texts[1]
         publish({"header": {"frame_id": "map"}, "info": info, "data": np.array([0, 100, -1, 5, 6, 7], np.int8)})
         await found.until(lambda: maps.latest is not None)
         request = maps.latest

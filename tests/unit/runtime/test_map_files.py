@@ -247,14 +247,14 @@ def test_an_image_is_looked_for_beside_its_yaml_and_at_home(tmp_path, monkeypatc
 
 def test_unknown_keys_are_kept_and_remarked_on(tmp_path):
     world = load_map(write(tmp_path, [[0]], floor=3))
-    assert [f"{tmp_path / 'm.yaml'}: floor: unknown key, left as it is"] == list(world.remarks)
+    assert [f"{tmp_path / 'm.yaml'}: floor: unknown key, left unchanged"] == list(world.remarks)
     save_map(world, tmp_path / "again.yaml")
     assert load_map(tmp_path / "again.yaml").others == {"floor": 3}
 
 
 def test_a_map_without_a_wall_is_remarked_on(tmp_path):
     (remark,) = load_map(write(tmp_path, [[255, 205]])).remarks
-    assert "not one occupied cell" in remark
+    assert "no occupied cell" in remark
     assert load_map(write(tmp_path, [[255, 0]])).remarks == ()
 
 

@@ -106,7 +106,7 @@ def test_a_damaged_or_mixed_save_is_refused_for_the_one_before(tmp_path: Path, n
         assert save.folder.name == "000002"
         (remark,) = save.remarks
     assert f"000003/{name if name != MANIFEST else ''}" in remark
-    assert remark.endswith("; an older save is read")
+    assert remark.endswith("; an older save is loaded instead")
     write_save(tmp_path, {"points.json": b"[]"}, POINTS)
     assert read(tmp_path) == {n: f"{n} b" for n in GRID} | {"points.json": "[]"}, (
         "what is added is added to the whole one"

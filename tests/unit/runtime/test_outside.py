@@ -47,7 +47,7 @@ def test_any_failure_becomes_a_refusal_with_file_and_expectation(body: Callable[
     [
         (NotImplementedError(), "NotImplementedError"),
         (SyntaxError("not a TIFF"), "SyntaxError: not a TIFF"),
-        (MemoryError(), "it needs more memory than there is"),
+        (MemoryError(), "there is not enough memory for it"),
         (RecursionError("maximum"), "it is nested too deeply"),
         (ValueError("two\n  lines"), "two lines"),
         (RuntimeError("x" * 1000), "RuntimeError: " + "x" * 200),

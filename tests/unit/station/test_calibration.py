@@ -98,7 +98,7 @@ async def test_a_wizard_asks_shows_its_result_and_saves_it_once_it_is_accepted()
     assert drawn["curve"] == [[1.0, 0.0], [0.0, 1.0]]
     assert measured["measured"] == {"rows": [ROW], "text": "12.6 V, False"}
     assert wizards.saved == 0
-    with pytest.raises(InputError, match="asks nothing now"):
+    with pytest.raises(InputError, match="not asking a question"):
         run.answer(1.0)
     with pytest.raises(InputError, match=r"battery\.gain runs already"):
         run.begin("battery.gain", {})
@@ -135,10 +135,10 @@ async def test_a_browser_that_leaves_ends_its_wizard_and_a_failure_is_shown():
     assert ended is not None
     await asyncio.wait([ended])
     assert wizards.cancelled
-    run, viewer = calibration(Wizards(NoAnswerError("sensor/battery: no message came for 10 s")))
+    run, viewer = calibration(Wizards(NoAnswerError("sensor/battery: no message received for 10 s")))
     run.begin("battery.gain", {})
     failed = await state(viewer)
-    assert (failed["phase"], failed["text"]) == ("failed", "sensor/battery: no message came for 10 s")
+    assert (failed["phase"], failed["text"]) == ("failed", "sensor/battery: no message received for 10 s")
 
 
 async def test_only_engineers_calibrate_and_a_station_without_wizards_says_so():
@@ -149,4 +149,4 @@ async def test_only_engineers_calibrate_and_a_station_without_wizards_says_so():
         await socket.send_json({"do": "calibrate", "id": 1, "order": "list"})
         while (frame := await socket.receive_json(timeout=10))["kind"] != "answer":
             pass
-        assert (frame["ok"], frame["text"]) == (False, "this station calibrates no robot")
+        assert (frame["ok"], frame["text"]) == (False, "this station does not calibrate robots")

@@ -110,7 +110,7 @@ async def test_the_file_of_users_is_read_again_when_it_changes(file: Path, caplo
     for damage in (*texts, lambda: file.chmod(0o644), file.unlink):
         damage()
         assert not await known.refresh()
-        assert caplog.messages[-1].startswith(f"the users stay as they were: {file}")
+        assert caplog.messages[-1].startswith(f"the user list is unchanged: {file}")
     assert await known.who(basic("bob", "long enough")) is not None
 
 
@@ -230,7 +230,7 @@ async def test_an_observer_sees_and_may_stop_and_nothing_else_over_tls(
                     while (message := await other.receive()).type is aiohttp.WSMsgType.TEXT:
                         pass
                     assert message.data == 1008
-                    assert "browser of ann is let go" in caplog.text
+                    assert "browser of ann disconnected" in caplog.text
                 async with session.get("/", headers=ann) as reply:
                     assert reply.status == 401
                 await socket.send_json({"do": "watch", "robot": "truck"})

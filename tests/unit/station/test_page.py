@@ -425,7 +425,7 @@ async def a_mission_of_a_robot_that_was_moved_goes_on_once_that_is_said(page: Pa
     await expect(page.locator("#mission-moved"), "unless the robot asks").to_be_hidden()
     refused = {"ok": False, "reason": "pose_lost", "text": "its pose is 3.0 m from where round was interrupted"}
     await say(page, {"kind": "slam", "m": {"standing": "searching", "overlap": 0.0}})
-    await press("#mission-resume", **refused | {"text": "its place on the saved map is not known (searching)"})
+    await press("#mission-resume", **refused | {"text": "its pose on the saved map is unknown (searching)"})
     await expect(page.locator("#mission-moved"), "its pose is not right").to_be_hidden()
     await say(page, {"kind": "slam", "m": {"standing": "localised", "overlap": 0.9}})
     assert await press("#mission-resume", **refused) == {"do": "mission", "order": "resume"}
@@ -619,7 +619,7 @@ async def the_link_that_failed_is_named_with_its_age(page: Page) -> None:
     await page.wait_for_function(
         "() => /^Station to robot: silent for/.test(document.querySelector('#chip-link').textContent)"
     )
-    text = "The station has heard nothing from truck for"
+    text = "The station has received no data from truck for"
     await page.wait_for_function(f"() => document.querySelector('#banners').textContent.startsWith('{text}')")
     gone = "class { static OPEN = 1; constructor() { setTimeout(() => this.onclose(), 0); } send() {} }"
     await page.evaluate(f"void (window.WebSocket = {gone})")
@@ -628,7 +628,7 @@ async def the_link_that_failed_is_named_with_its_age(page: Page) -> None:
     await page.wait_for_function(
         "() => /^Browser to station: lost for . s$/.test(document.querySelector('#chip-link').textContent)"
     )
-    text = "This browser has had no connection to the station for"
+    text = "This browser has lost the station for"
     await expect(page.locator("#banners")).to_contain_text(text)
 
 
@@ -870,7 +870,7 @@ async def a_wizard_asks_and_its_result_is_accepted_beside_the_one_before(page: P
     fresh = {"name": "fresh", "default": False, "help": "Forget the earlier readings.", **bounds}
     wizards[1]["options"] = [{"name": "meter_error", "default": 0.5, "help": "Of the meter, %.", **bounds}, fresh]
     await say(page, {"kind": "answer", "id": (await asked())["id"], "ok": True, "value": {"wizards": wizards}})
-    await expect(page.locator("#wizards button")).to_have_text(["First look at drive", "Calibrate battery"])
+    await expect(page.locator("#wizards button")).to_have_text(["Rough calibration of drive", "Calibrate battery"])
     await page.click("#wizards summary")
     await page.get_by_label("meter error").fill("0.8")
     await page.locator("#wizards button").last.click()
@@ -912,7 +912,7 @@ async def a_wizard_asks_and_its_result_is_accepted_beside_the_one_before(page: P
     await page.click("#wizard-accept")
     assert (await asked())["order"] == "accept"
     await say(page, state | {"phase": "saved", "text": "0002.json"})
-    await expect(page.locator("#wizard-text")).to_contain_text("0002.json; it counts from the next start")
+    await expect(page.locator("#wizard-text")).to_contain_text("0002.json; the daemon applies it at its next start")
     await expect(page.locator("#wizards")).to_be_visible()
     await page.click("#tab-drive")
 

@@ -44,7 +44,7 @@ def test_every_number_of_a_topic_is_offered_with_its_meaning_also_within_records
 
 @pytest.mark.parametrize("name", ["", "state/gate", "state/gate:mode", "state/gate:__class__", "req/drive:speed"])
 def test_what_is_no_number_is_refused_by_its_name(name: str):
-    with pytest.raises(InputError, match=f"^{name}: expected a number of a topic"):
+    with pytest.raises(InputError, match=f"^{name}: expected a numeric field of a topic"):
         require_numbers([VOLTAGE, name])
 
 

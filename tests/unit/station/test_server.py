@@ -211,7 +211,7 @@ async def test_rubbish_of_a_browser_costs_a_few_lines_and_how_many_more_there_we
             answers += message["kind"] == "trouble"
         async with session.get("/", headers={"Host": "elsewhere.example"}):
             pass
-    reported = [text for text in caplog.messages if text.endswith("further lines left out")]
+    reported = [text for text in caplog.messages if text.endswith("further lines not logged")]
     assert len(reported) == 1
     left_out = int(reported[0].removeprefix("127.0.0.1: ").split()[0])
     assert left_out == count + 3 - BURST, "with those of who came, went and was refused"
@@ -228,7 +228,7 @@ async def test_lines_are_counted_for_each_address_and_anew_after_a_while(
     assert len(caplog.messages) == MOST_PEERS + BURST
     caplog.clear()
     await asyncio.sleep(0.1)
-    assert caplog.messages == [f"other addresses: {2 * MOST_PEERS - BURST} further lines left out"]
+    assert caplog.messages == [f"other addresses: {2 * MOST_PEERS - BURST} further lines not logged"]
     made.add("10.0.0.95", "again\x1b]0;title\x07\nfaked")
     assert caplog.messages[-1] == r"again\x1b]0;title\x07\nfaked"
     made.add("10.0.0.95", "x" * 10_000)

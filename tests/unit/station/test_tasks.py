@@ -409,7 +409,7 @@ async def test_a_recording_that_nobody_looks_at_makes_room_for_another(monkeypat
         titles.append(await station.replay(address, "run-2.mcap", "", viewer))
         assert list(station.replays) == [titles[0], titles[2]]
         station.replays[titles[2]].attach(viewer)
-        with pytest.raises(InputError, match="looked at"):
+        with pytest.raises(InputError, match="being replayed"):
             await station.replay(address, "run-3.mcap", "", viewer)
         station.replays[titles[2]].detach(viewer)
 
@@ -420,7 +420,7 @@ async def test_a_recording_that_nobody_looks_at_makes_room_for_another(monkeypat
         assert (state["at"], state["playing"]) == (7.0, False)
         station.replays[titles[2]].detach(viewer)
         grown = station.replays[titles[2]]
-        with pytest.raises(InputError, match="does not hold this moment"):
+        with pytest.raises(InputError, match="does not contain this time"):
             await station.replay(address, "run-2.mcap", "", viewer, begin + 70 * SECOND)
         assert station.replays[titles[2]] is not grown, "it was fetched again: it may have grown"
 

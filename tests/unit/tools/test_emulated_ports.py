@@ -64,7 +64,7 @@ async def test_a_second_simulator_is_refused_and_leaves_the_first_alone(own: Pat
         await serve(WallClock(), [config], print)
     port = f"{own}/ports/truck/lidar: another program (process {os.getpid()}) serves this port"
     assert str(refused.value).startswith(
-        f"{port}: probably another `simulate` on this computer; Ctrl-C in its terminal"
+        f"{port}: probably another `simulate` on this computer; end it with Ctrl-C in its terminal"
     )
     assert refused.value.reason.exit_code == 7
     with claimed(*paths(config).values()):
@@ -97,7 +97,7 @@ def test_a_port_that_this_user_may_not_make_is_refused_by_its_name(tmp_path: Pat
 
     monkeypatch.setattr(ports, "reserved", forbidden)
     port = tmp_path / "lidar"
-    with pytest.raises(NotPermittedError, match=rf"^{port}: this user may not make a port there$"), claimed(port):
+    with pytest.raises(NotPermittedError, match=rf"^{port}: this user may not create a port there$"), claimed(port):
         pass
 
 

@@ -47,13 +47,13 @@ def test_two_robots_of_one_name_are_refused():
         ),
         ({"zenoh": {"listen": ("tcp/127.0.0.1:7447",)}}, "zenoh.listen tcp/127.0.0.1:7447: of leader and of second"),
         ({"state_directory": Path("runs/leader/state")}, "state_directory runs/leader/state"),
-        ({"sim": {"world": {"map": "rooms"}}}, "second: sim.world.map is rooms: expected that of leader, yard"),
+        ({"sim": {"world": {"map": "rooms"}}}, "second: sim.world.map is rooms: expected the value of leader, yard"),
         (
             {"sim": {"world": {"engine": "mujoco"}}},
             "second: sim.world.engine is mujoco: expected that of leader, plane",
         ),
         ({"sim": {"world": {"rough": ({"x": 1.0, "y": 0.0},)}}}, "second: sim.world.rough is (RoughPatch(x=1.0"),
-        ({"sim": {"world": {"people": ({},)}}}, "second: sim.world.people: expected none, or those of leader"),
+        ({"sim": {"world": {"people": ({},)}}}, "second: sim.world.people: expected none, or the same as leader"),
     ],
 )
 def test_what_two_robots_claim_is_refused(overlay, said):

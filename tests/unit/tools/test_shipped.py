@@ -53,7 +53,9 @@ def test_a_file_comes_before_a_bundled_configuration(tmp_path: Path, monkeypatch
 
 def test_an_unknown_name_is_refused_with_the_nearest_or_with_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ConfigError, match=r"^gaols: no file and no bundled configuration; did you mean 'goals'\?$"):
+    with pytest.raises(
+        ConfigError, match=r"^gaols: neither a file nor a bundled configuration; did you mean 'goals'\?$"
+    ):
         places.configuration(Path("gaols"))
     with pytest.raises(ConfigError, match=r"expected a file or one of .*explore, .*robots/mecanum"):
         places.configuration(Path("zzz"))
@@ -66,7 +68,7 @@ def test_commands_take_a_bundled_configuration_by_name(tmp_path: Path, monkeypat
     shown = CliRunner().invoke(app, ["config", "show", "mecanum", "--key", "robot"])
     assert (shown.exit_code, "mecanum" in shown.stdout) == (0, True), shown.output
     refused = CliRunner().invoke(app, ["simulate", "--robots", "mecanum,gaols"])
-    assert "gaols: no file and no bundled configuration" in refused.output
+    assert "gaols: neither a file nor a bundled configuration" in refused.output
 
 
 def test_the_demos_configuration_is_there():

@@ -291,7 +291,7 @@ def collect(path: str | Path, progress: Progress | None = None) -> RunSummary:
         if progress is not None and number % 2000 == 0:
             progress(reader.position)
     if run.messages == 0:
-        msg = f"{path}: holds no messages" + (f"; {reader.damage}" if reader.damage else "")
+        msg = f"{path}: contains no messages" + (f"; {reader.damage}" if reader.damage else "")
         raise InputError(msg)
     run.damage = reader.fault
     _describe(run, reader)

@@ -122,7 +122,7 @@ def _head(run: RunSummary) -> str:
     badges = [
         _badge(run.event_counts[Severity.ERROR], "error", Tone.BAD),
         _badge(run.event_counts[Severity.WARNING], "warning", Tone.WARNING),
-        ("log is whole", Tone.GOOD) if run.damage is None else (f"log {run.damage}", Tone.BAD),
+        ("log is intact", Tone.GOOD) if run.damage is None else (f"log {run.damage}", Tone.BAD),
         ("no message lost", Tone.GOOD) if not run.lost else (f"{run.lost} messages lost", Tone.BAD),
     ]
     if run.drops:

@@ -240,7 +240,7 @@ class Dock(AtDock[DockingConfig]):
         if left <= 0.002:  # stopping distance from the lowest speed, m
             return self._next(state, "settle", t)
         if left < STEERING_LENGTH and abs(predicted(across, turn, left)) > self._config.tolerance:
-            text = f"{across * 1000:+.0f} mm and {math.degrees(turn):+.1f} degrees off the axis of {self._name}"
+            text = f"{across * 1000:+.0f} mm and {math.degrees(turn):+.1f} degrees from the axis of {self._name}"
             return self._failed(state, t, Reason.DOCK_MISSED, text)
         if not self._reverse and t - state.seen > 1.0:  # the tag is hidden: stand, s
             if t - state.seen > self._config.look:
@@ -287,7 +287,7 @@ class Dock(AtDock[DockingConfig]):
         faces = state.phase in ("approach", "settle", "charge") or not self._reverse
         if state.attempt < self._config.attempts and state.tag is not None and faces:
             return self._next(replace(state, attempt=state.attempt + 1), "retreat", t)
-        return BehaviourStep(None, state, state.phase, reason, f"{text}, at attempt {state.attempt}")
+        return BehaviourStep(None, state, state.phase, reason, f"{text}, attempt {state.attempt}")
 
     def _done(self, state: Docking, text: str) -> BehaviourStep:
         return BehaviourStep(None, state, state.phase, Reason.BEHAVIOUR_DONE, text)

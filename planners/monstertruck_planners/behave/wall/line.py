@@ -376,20 +376,26 @@ class WallLine:
         for name, (value, count, first) in zip(self._names, state.equal, strict=True):
             if count >= equal[0] and state.travelled - first >= equal[1]:
                 distance = state.travelled - first
-                return Reason.INPUT_CONTRADICTORY, f"sonar {name} measured {value:.3f} m all along {distance:.2f} m"
+                return (
+                    Reason.INPUT_CONTRADICTORY,
+                    f"sonar {name} measured a constant {value:.3f} m over {distance:.2f} m",
+                )
         turns, stands = state.strays
         if turns is not None and t - turns > STRAY[1]:
-            text = f"{state.w.at(t) * self._mirror:.2f} rad/s asked for and not turned: does a motor stall?"
+            text = (
+                f"{state.w.at(t) * self._mirror:.2f} rad/s requested but the robot did not turn: check for a "
+                "stalled motor"
+            )
             return Reason.STUCK, text
         # 1.0: time without the requested motion until the robot is considered stuck, s
         if stands is not None and t - stands > 1.0:
-            return Reason.STUCK, f"{state.v.at(t):.2f} m/s asked for, {odometry.twist.vx:.2f} m/s driven"
+            return Reason.STUCK, f"{state.v.at(t):.2f} m/s requested, {odometry.twist.vx:.2f} m/s driven"
         if state.phase == "turn" and state.turned - state.marks[1] < 0.05:  # a turn is starting up to this angle, rad
             for number in (DIAGONAL, FRONT, FAR):
                 if 0.0 < (near := state.equal[number][0]) < TOUCHING:
-                    return Reason.STUCK, f"sonar {self._names[number]} measures {near:.2f} m: too near to turn away"
+                    return Reason.STUCK, f"sonar {self._names[number]} measures {near:.2f} m: too close to turn away"
         if state.phase == "turn" and state.turned - state.marks[1] > 1.2 * math.tau:
-            return Reason.STUCK, "turned once around and found no wall to follow"
+            return Reason.STUCK, "turned a full circle and found no wall to follow"
         if state.phase == "search" and state.travelled - state.marks[0] > self._config.search:
             return Reason.STUCK, f"no wall within {self._config.search:.0f} m"
         return None
@@ -410,7 +416,7 @@ class WallLine:
         for number, (share, other) in enumerate((shares, shares[::-1])):
             if share < DISAGREES and other > AGREES:
                 name = self._names[number]
-                return Reason.INPUT_CONTRADICTORY, f"sonar {name} does not measure the wall that its neighbour does"
+                return Reason.INPUT_CONTRADICTORY, f"sonar {name} does not detect the wall that its neighbour measures"
         return None
 
     # Phases

@@ -144,9 +144,9 @@ class _Wall(ABC):
         state = _stall_timed(state, odometry.twist.vx, t)
         # 1.0: a motor is stalled after this time of requested but not measured motion, s
         if fault is None and state.moving_since is not None and t - state.moving_since >= 1.0:
-            fault = Reason.STUCK, f"{state.asked:.2f} m/s asked for, {odometry.twist.vx:.2f} m/s driven"
+            fault = Reason.STUCK, f"{state.asked:.2f} m/s requested, {odometry.twist.vx:.2f} m/s driven"
         if fault is None and state.phase == "turn_away" and state.turned - state.turned_before > math.tau:
-            fault = Reason.STUCK, "turned once around and found no wall to follow"
+            fault = Reason.STUCK, "turned a full circle and found no wall to follow"
         if fault is not None:
             return BehaviourStep(None, state, state.phase, *fault)
         hold, furthest = self._shared.hold, sonars.range_max

@@ -308,7 +308,7 @@ def test_a_stranger_unknown_faults_and_impossible_settings_are_refused():
                 rig.port.device.write(b"$" + await rig.port.device.read() + b"\n")
 
         async with rig.plugged_in(parrot()):
-            with pytest.raises(WrongDeviceError, match="no answer of ROSArduinoBridge"):
+            with pytest.raises(WrongDeviceError, match="not an answer of ROSArduinoBridge"):
                 await rig.session()
         with pytest.raises(InputError, match="known: silent"):
             rig.emulator.inject("late")

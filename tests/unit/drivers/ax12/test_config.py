@@ -27,7 +27,7 @@ def test_angle_and_position_are_inverse(angle: float, direction: int):
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"zero": 400}, "min_position 409 < zero 400 < max_position 613 does not hold"),
+        ({"zero": 400}, "expected min_position 409 < zero 400 < max_position 613"),
         ({"max_position": 1024}, "less than or equal to 1023"),
         ({"id": 253}, "less than or equal to 252"),
         ({"direction": 0}, "-1 or 1"),
@@ -44,7 +44,7 @@ def test_one_id_for_both_is_refused():
 
 
 def test_rests_in_order():
-    with pytest.raises(ValidationError, match=r"rest 9\.0 <= rest_max 8\.0 does not hold"):
+    with pytest.raises(ValidationError, match=r"expected rest 9\.0 <= rest_max 8\.0"):
         AlarmConfig(rest=9.0, rest_max=8.0)
 
 

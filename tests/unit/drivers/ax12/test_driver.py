@@ -195,7 +195,7 @@ def test_settings_reach_the_unit():
 
 def test_silence_is_a_timeout_with_advice():
     async def test(rig: Rig) -> None:
-        with pytest.raises(DeviceTimeoutError, match="silence; expected AX-12A units 1 and 2: is the 12 V rail up"):
+        with pytest.raises(DeviceTimeoutError, match="silent; expected AX-12A units 1 and 2: check the 12 V rail"):
             await rig.session()
         assert rig.ready_at == []
 

@@ -258,7 +258,7 @@ def test_bad_faults_are_refused_with_what_was_expected(fault: tuple[str, ...], m
 
 def test_a_fault_of_a_unit_that_is_not_there():
     async def test(bus: Ax12Bus, _host, _clock) -> None:
-        with pytest.raises(InputError, match=r"no unit 5; there are \[1, 2\]"):
+        with pytest.raises(InputError, match=r"no unit 5; expected one of \[1, 2\]"):
             bus.inject("vanish", "5")
         with pytest.raises(InputError, match="no unit 5"):
             bus.angle(5, SECOND)

@@ -79,7 +79,7 @@ def test_differential_inputs_are_no_channels(tmp_path: Path):
 
 @pytest.mark.parametrize(
     ("files", "text"),
-    [({"in_voltage1_raw": "1"}, r"no channel 0; there: \[1\]"), ({"in_voltage0_raw": "1"}, "has scale None")],
+    [({"in_voltage1_raw": "1"}, r"no channel 0; available: \[1\]"), ({"in_voltage0_raw": "1"}, "has scale None")],
 )
 def test_a_channel_that_cannot_be_read_is_a_mismatch(tmp_path: Path, files: dict[str, str], text: str):
     converter(tmp_path, **files)

@@ -168,7 +168,7 @@ def test_charge_follows_the_table_and_stays_within_its_ends():
 
 
 def test_limits_must_be_in_order():
-    with pytest.raises(ValueError, match=r"overcharged_clear 25\.4 < overcharged 25\.3 does not hold"):
+    with pytest.raises(ValueError, match=r"overcharged_clear 25\.4 < overcharged 25\.3"):
         PackConfig(overcharged_clear=25.4)
 
 

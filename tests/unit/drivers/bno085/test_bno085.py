@@ -134,7 +134,7 @@ def test_bytes_lost_or_one_at_a_time():
     ("trouble", "error", "text"),
     [
         (lambda rig: rig.emulator.inject("silent", "on"), DeviceTimeoutError, "silent for 0.3 s"),
-        (lambda rig: rig.emulator.inject("frozen", "on"), ProtocolError, "the same to the last bit"),
+        (lambda rig: rig.emulator.inject("frozen", "on"), ProtocolError, "in a row are identical"),
         (lambda rig: rig.emulator.inject("bad_checksum", "999"), ProtocolError, "but no measurement"),
         (lambda rig: rig.port.unplug(), DeviceLostError, "unplugged"),
     ],

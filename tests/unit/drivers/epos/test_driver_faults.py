@@ -42,7 +42,7 @@ def test_a_passing_fault_is_reported_reset_and_driving_goes_on_from_0():
         assert (reason, severity) == (Reason.DRIVE_FAULT, Severity.ERROR)
         assert "0x3210 (over-voltage)" in text
         assert values == {"code": 0x3210}
-        assert "gone" in rig.events.kept[2][2]
+        assert "cleared" in rig.events.kept[2][2]
         reset = controls(rig).index(Control.FAULT_RESET)
         assert controls(rig)[reset - 1] == Control.DISABLE_VOLTAGE, "an edge"
         assert controls(rig).count(Control.FAULT_RESET) == 1
@@ -87,7 +87,7 @@ def test_a_permanent_fault_ends_after_three_resets_and_waits_for_its_cause():
 def test_a_permanent_fault_raises():
     async def test(rig: Rig) -> None:
         rig.emulator.inject("fault", "following")
-        with pytest.raises(DeviceFaultError, match=r"0x8611 \(following error\) stays after 3 resets"):
+        with pytest.raises(DeviceFaultError, match=r"0x8611 \(following error\) persists after 3 resets"):
             await rig.session()
         assert rig.ready_at == []
 
@@ -125,9 +125,9 @@ def test_another_device_on_the_port():
                     await clock.sleep(0.1)
 
             async with background(compass(rig.port.device)):
-                with pytest.raises(WrongDeviceError, match=r"no EPOS, sends"):
+                with pytest.raises(WrongDeviceError, match=r"not an EPOS, it sends"):
                     await rig.session()
-                with pytest.raises(WrongDeviceError, match=r"no EPOS, sends"):
+                with pytest.raises(WrongDeviceError, match=r"not an EPOS, it sends"):
                     await DEVICES["epos"].identify(rig.port, clock)
             assert rig.ready_at == []
 
@@ -172,7 +172,7 @@ def test_other_parameters_than_configured(config: EposConfig, message: str):
     on_bench(test, config)
 
 
-@pytest.mark.parametrize("missing", [(od.CONTROLWORD, "no EPOS 24/1"), (od.SOFTWARE_VERSION, "without 0x2003/1")])
+@pytest.mark.parametrize("missing", [(od.CONTROLWORD, "not an EPOS 24/1"), (od.SOFTWARE_VERSION, "without 0x2003/1")])
 def test_an_object_server_that_is_no_epos(missing: tuple[od.ObjectEntry, str], monkeypatch: pytest.MonkeyPatch):
     entry, message = missing
     monkeypatch.delitem(od.OBJECTS, (entry.index, entry.sub))

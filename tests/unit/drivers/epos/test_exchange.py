@@ -202,7 +202,7 @@ def test_a_refused_frame_is_sent_once_more():
         emulator.inject("refuse", "1")
         assert await time_of(clock, line.read(od.STATUSWORD)) < 0.01
         emulator.inject("refuse", "2")
-        with pytest.raises(ProtocolError, match="refused twice"):
+        with pytest.raises(ProtocolError, match="rejected twice"):
             await line.read(od.STATUSWORD)
 
     on_line(test)
@@ -441,7 +441,7 @@ def test_a_process_stood_still_if_a_wait_took_as_long_as_a_half_frame_is_kept(ea
     async def test(peer: Peer, line: Exchanger) -> None:
         asked = line._clock.now() - round(QUIET * SECOND) + early
         if held_up:
-            with pytest.raises(_HeldUpError, match=r"stood still for 0\.6 s"):
+            with pytest.raises(_HeldUpError, match=r"suspended for 0\.6 s"):
                 line._check_held_up(asked)
         else:
             line._check_held_up(asked)
@@ -465,7 +465,7 @@ def test_a_refused_read_names_the_object_and_a_refused_write_its_value():
 def test_after_a_standstill_of_this_process_a_new_exchange_begins_at_once(reply: int):
     async def test(peer: Peer, line: Exchanger) -> None:
         peer.stand_still_before = reply
-        with pytest.raises(DeviceTimeoutError, match=r"stood still for 1\.5 s"):
+        with pytest.raises(DeviceTimeoutError, match=r"suspended for 1\.5 s"):
             await line.read(od.STATUSWORD)
         peer.replies = [O, O + b"\0", ANSWER]
         begun = len(peer.written)

@@ -133,7 +133,7 @@ def test_resets_longer_ago_than_their_window_do_not_count():
 def test_no_reset_at_all_if_so_configured():
     async def test(rig: Rig) -> None:
         rig.emulator.inject("fault", "following")
-        with pytest.raises(DeviceFaultError, match="stays after 0 resets"):
+        with pytest.raises(DeviceFaultError, match="persists after 0 resets"):
             await rig.session()
         assert Control.FAULT_RESET not in controls(rig)
 

@@ -237,7 +237,7 @@ def test_a_stall_ends_the_session_within_five_periods():
             await rig.out.total(3)
             rig.port.device.faults.stalled = True
             start = clock.now()
-            with pytest.raises(DeviceTimeoutError, match="no good scan"):
+            with pytest.raises(DeviceTimeoutError, match="no valid scan"):
                 await task
             return clock.now() - start
 
@@ -377,7 +377,7 @@ def test_another_device_on_the_port(answer: bytes):
             with contextlib.suppress(asyncio.CancelledError):
                 await device
 
-    with pytest.raises(WrongDeviceError, match="does not speak SCIP"):
+    with pytest.raises(WrongDeviceError, match="does not use SCIP"):
         run_virtual(main)
 
 
@@ -538,7 +538,7 @@ def test_scans_that_stay_late_start_the_session_anew():
             rig.port.device.faults.delay = 0.35
             await clock.sleep(10.0)
 
-    with pytest.raises(DeviceTimeoutError, match="s later than at the start"):
+    with pytest.raises(DeviceTimeoutError, match="s since the start"):
         run_virtual(main)
 
 

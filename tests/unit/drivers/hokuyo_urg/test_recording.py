@@ -82,7 +82,7 @@ def _line(time: int, value: str = "100") -> str:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "holds no scans"),
+        ("", "contains no scans"),
         ("1 2 3\n", ":1: expected 707 numbers, found 3"),
         (_line(5) + "\n" + _line(5), ":2: time 5 does not increase"),
         (_line(5, "x"), ":1: expected whole numbers"),

@@ -212,7 +212,7 @@ def test_a_clock_answer_without_time_is_refused():
 
 def test_without_its_time_adjust_mode_it_streams_all_the_same():
     """Twelve restarts in six seconds, and no scan."""
-    with pytest.raises(DeviceTimeoutError, match="no good scan"):  # the stream began; the script ends there
+    with pytest.raises(DeviceTimeoutError, match="no valid scan"):  # the stream began; the script ends there
         drive(Script(TM0=[build_reply("TM0", "01")]))
 
 
@@ -225,7 +225,7 @@ def test_a_status_that_no_stream_has():
 def test_replies_to_nothing_are_passed_over_in_a_stream():
     ack = HEALTHY["MD0044072501000"][0]
     script = Script(MD0044072501000=[ack + build_reply("II", "00")])
-    with pytest.raises(DeviceTimeoutError, match="no good scan"):
+    with pytest.raises(DeviceTimeoutError, match="no valid scan"):
         drive(script)
     assert script.heard[-1] == "QT"
 

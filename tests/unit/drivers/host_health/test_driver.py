@@ -142,7 +142,7 @@ def test_a_broken_proc_ends_the_session(tmp_path: Path):
 
 
 def test_limits_must_leave_room():
-    with pytest.raises(ValueError, match=r"hot_clear 75\.0 < hot 70\.0 does not hold"):
+    with pytest.raises(ValueError, match=r"hot_clear 75\.0 < hot 70\.0"):
         HostHealthConfig(hot=70.0)
 
 

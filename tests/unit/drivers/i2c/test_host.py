@@ -60,7 +60,10 @@ def test_a_late_answer_is_never_taken_for_the_next_one():
 
 @pytest.mark.parametrize(
     ("number", "error", "text"),
-    [(errno.ENODEV, DeviceLostError, "the bus is gone"), (errno.ETIMEDOUT, DeviceTimeoutError, "Connection timed out")],
+    [
+        (errno.ENODEV, DeviceLostError, "the bus was removed"),
+        (errno.ETIMEDOUT, DeviceTimeoutError, "Connection timed out"),
+    ],
 )
 def test_errors_of_the_kernel(number, error, text):
     async def main(clock):

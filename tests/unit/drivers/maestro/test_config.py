@@ -50,8 +50,8 @@ def test_adc_scale():
         (lambda: BatteryInputConfig(low=22.5), "low 22.5 < clear 22.4"),
         (lambda: BatteryInputConfig(gain=0.4), "reading 1023"),
         (lambda: BatteryInputConfig(offset=16.0), "reading 0"),
-        (lambda: MaestroConfig(deadman_channel=5), "one use only"),
-        (lambda: MaestroConfig(rear=ServoConfig(channel=1)), "one use only"),
+        (lambda: MaestroConfig(deadman_channel=5), "only one use"),
+        (lambda: MaestroConfig(rear=ServoConfig(channel=1)), "only one use"),
         (lambda: MaestroConfig(baud=9600), "Extra inputs"),
     ],
 )

@@ -113,7 +113,7 @@ def test_answers_out_of_form_end_the_session():
             rig.port.device.faults.flip_rate = 1.0
             await rig.settle(2)
 
-    with pytest.raises(ProtocolError, match="out of form"):
+    with pytest.raises(ProtocolError, match="malformed answers"):
         on_bench(test)
 
 
@@ -286,6 +286,6 @@ def test_pulses_beyond_the_limits_are_no_angles(pulse: str):
         reach = MaestroConfig().front.reach
         assert all(reach[0] - 0.01 <= feedback.front <= reach[1] + 0.01 for feedback in rig.out.kept)
         assert not all(feedback.trusted for feedback in rig.out.kept)
-        assert "pulses beyond" in " ".join(text for _, _, text, _ in rig.events.kept)
+        assert "pulses outside" in " ".join(text for _, _, text, _ in rig.events.kept)
 
     on_bench(test, MaestroConfig(deadman_feed="always"))

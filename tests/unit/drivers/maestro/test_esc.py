@@ -197,7 +197,7 @@ def test_the_probe_finds_the_unit():
 
 
 def test_channels_have_one_use_and_another_device_may_not_steer():
-    with pytest.raises(ValidationError, match="the unit uses it for something else"):
+    with pytest.raises(ValidationError, match="another function of the unit uses this channel"):
         MaestroEscConfig(esc=EscConfig(channel=FRONT))
     with pytest.raises(ValidationError, match="compact protocol without CRC"):
         MaestroEscConfig(unit=MaestroConfig(use_crc=True))

@@ -141,7 +141,7 @@ def test_answers_that_stay_too_long_are_given_up():
         with pytest.raises(DeviceTimeoutError):
             await peer.session.ask(ERRORS)
         peer.replies = [words(CENTRE) + b"\0"] * 9
-        with pytest.raises(DeviceTimeoutError, match="answers stay out of step"):
+        with pytest.raises(DeviceTimeoutError, match="answers remain out of step"):
             await peer.session.ask(ERRORS)
         assert peer.written == [ERRORS, *[POSITION] * RESYNC_TRIES]
         assert RESYNC_TRIES == 4
@@ -165,7 +165,7 @@ def test_identify_reads_the_positions_and_returns_the_errors():
 def test_a_device_that_answers_out_of_form_is_no_maestro(answer: bytes):
     async def test(peer: Peer, _: VirtualClock) -> None:
         peer.replies = [answer if reply is None else reply for reply in peer.replies]
-        with pytest.raises(WrongDeviceError, match="no Maestro"):
+        with pytest.raises(WrongDeviceError, match="not a Maestro"):
             await peer.session.identify(0)
         assert peer.written.count(POSITION + ERRORS) == IDENTIFY_ATTEMPTS == 3
 
@@ -181,7 +181,7 @@ def test_one_answer_out_of_form_is_asked_for_again():
 
 def test_silence_names_what_to_set():
     async def test(peer: Peer, _: VirtualClock) -> None:
-        with pytest.raises(DeviceTimeoutError, match="silence; expected a Maestro's Command Port"):
+        with pytest.raises(DeviceTimeoutError, match="silent; expected a Maestro's Command Port"):
             await peer.session.identify(0)
 
     with_peer()(test)

@@ -97,9 +97,9 @@ def test_a_stuck_camera_ends_the_session_and_comes_back(way):
             rig.emulator.inject("stuck", "on")
 
         async with background(stick()):
-            with pytest.raises(DeviceTimeoutError, match=r"no picture for 1\.0 s"):
+            with pytest.raises(DeviceTimeoutError, match=r"no image for 1\.0 s"):
                 await rig.session()
-        with pytest.raises(DeviceTimeoutError, match=r"no picture for 1\.0 s"):
+        with pytest.raises(DeviceTimeoutError, match=r"no image for 1\.0 s"):
             await rig.session()
         rig.emulator.inject("stuck", "off")
         async with rig.driving():
@@ -113,7 +113,7 @@ def test_answers_of_servers_that_are_no_camera():
     async def test(rig):
         for fault, error, text in (
             (("status", "401"), DeviceMismatchError, "/dev/test/stream: the server answers 401 Refused"),
-            (("text", "on"), WrongDeviceError, "the server gives text/html, not pictures"),
+            (("text", "on"), WrongDeviceError, "the server sends text/html, not images"),
         ):
             rig.emulator.inject(*fault)
             with pytest.raises(error, match=text):
@@ -126,8 +126,8 @@ def test_answers_of_servers_that_are_no_camera():
 @pytest.mark.parametrize(
     ("answer", "text"),
     [
-        (b"SSH-2.0-OpenSSH_9\r\n\r\n", "no HTTP server: the answer begins with 'SSH-2.0"),
-        (b"HTTP/1.1 200 OK\r\n" + b"x" * 20_000, "no end of the answer's head"),
+        (b"SSH-2.0-OpenSSH_9\r\n\r\n", "not an HTTP server: the answer begins with 'SSH-2.0"),
+        (b"HTTP/1.1 200 OK\r\n" + b"x" * 20_000, "header of the answer does not end"),
         (
             b"HTTP/1.1 200 OK\r\nContent-Type: image/jpeg\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n",
             "expected the length of a chunk",
@@ -157,7 +157,7 @@ def test_a_size_that_differs_is_reported_once():
                 await rig.settle(0.5)
         ((reason, _, text, _),) = rig.events.kept
         assert reason is Reason.DEVICE_MISMATCH
-        assert "the camera gives 320x240 at 15 Hz, configured is 160x120" in text
+        assert "the camera offers 320x240 at 15 Hz, expected 160x120" in text
         assert (await DEVICES["mjpeg"].identify(rig.port, rig.clock, rig.config))["width"] == 320
 
     on_bench(test, emulated=MjpegConfig(width=320, height=240))

@@ -48,7 +48,7 @@ def test_a_pulse_is_right_to_half_a_count(angle, frequency, oscillator):
     [
         (lambda: Pca9685Config(rear=Pca9685Servo(channel=0)), "share channel 0"),
         (lambda: Pca9685Config(frequency=330, front=Pca9685Servo(max_us=3500)), "longer than a cycle"),
-        (lambda: Pca9685EscConfig(esc=Pca9685Esc(channel=0)), "a servo has this channel"),
+        (lambda: Pca9685EscConfig(esc=Pca9685Esc(channel=0)), "a servo uses this channel"),
         (
             lambda: Pca9685EscConfig(esc=Pca9685Esc(neutral_us=2600, reach_us=1000), unit=Pca9685Config(frequency=330)),
             "longest pulse of esc",

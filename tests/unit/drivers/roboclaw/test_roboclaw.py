@@ -149,7 +149,7 @@ def test_a_unit_that_restarts_ends_the_session_and_no_position_jumps():
             rig.emulator.inject("reset")
 
         async with background(restart()):
-            with pytest.raises(DeviceRestartedError, match="restarted its count"):
+            with pytest.raises(DeviceRestartedError, match="restarted its counters"):
                 await rig.session()
         last = rig.out.last
         assert rig.events.reasons()[-1] is Reason.DEVICE_RESTARTED

@@ -147,6 +147,6 @@ def test_a_blocked_head_a_few_wrong_sums_and_unknown_faults():
 
 
 def test_ranges_must_rise():
-    with pytest.raises(ValidationError, match="expected them to rise"):
+    with pytest.raises(ValidationError, match="expected increasing values"):
         SheetLidarConfig(range_max=4.0, range_dark=5.0)
     assert SheetLidarConfig(range_dark=5.0).sheet.sure == 5.0

@@ -292,7 +292,7 @@ def test_silence_ends_the_session():
 @pytest.mark.parametrize(("motors", "steps"), [(2, 400), (4, 200)])
 def test_other_motors_than_configured_are_refused(motors, steps):
     async def test(rig):
-        with ended(DeviceMismatchError, f"{motors} motors of {steps} steps"):
+        with ended(DeviceMismatchError, f"{motors} motors with {steps} steps"):
             await rig.session()
 
     on_bench(test, motors=motors, steps_per_turn=steps)

@@ -180,7 +180,7 @@ def test_a_hub_that_stays_but_loses_all_devices_is_one_event(tmp_path: Path):
 
     bench = play(tmp_path, scene)
     assert bench.events.reasons == [Reason.HUB_LOST, Reason.HUB_RETURNED]
-    assert "all behind it vanished" in bench.events.of(Reason.HUB_LOST)[0][2]
+    assert "all devices behind it disappeared" in bench.events.of(Reason.HUB_LOST)[0][2]
 
 
 def test_the_only_device_of_a_hub_is_not_the_hub(tmp_path: Path):

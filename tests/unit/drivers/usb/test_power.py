@@ -123,7 +123,7 @@ def test_nothing_is_switched_unless_configured(tmp_path: Path):
             await bench.power.cycle("1-1.1")
 
     play(tmp_path, scene, by(None))
-    with pytest.raises(ValidationError, match="only by a method"):
+    with pytest.raises(ValidationError, match="needs a method"):
         PowerConfig(after=3)
 
 

@@ -178,7 +178,7 @@ def test_a_port_is_not_switched_sooner_because_its_bus_got_another_number(tmp_pa
         await bench.power.cycle(port)
         bench.usb.renumber({"1": "4"})
         for name in (port, "4-1.3"):
-            with pytest.raises(BusyError, match="hub 4-1 port 3 was switched just now"):
+            with pytest.raises(BusyError, match="hub 4-1 port 3 was switched moments ago"):
                 await bench.power.cycle(name)
 
     play(tmp_path, scene, UsbConfig(power=PowerConfig(method=CycleMethod.AUTHORIZED)), places=BY_TOPOLOGY)

@@ -132,7 +132,7 @@ def test_another_mode_is_used_and_reported_once():
             async with background(driver.run(rig._ready)):
                 await rig.out.count(3)
         assert rig.events.reasons() == [Reason.DEVICE_MISMATCH]
-        assert "gives 160x120 at 30 Hz, configured is 150x100 at 60 Hz" in rig.events.kept[0][2]
+        assert "offers 160x120 at 30 Hz, expected 150x100 at 60 Hz" in rig.events.kept[0][2]
 
     on_bench(test, width=150, height=100, rate=60.0)
 
@@ -199,7 +199,7 @@ def test_a_stuck_camera_ends_the_session_after_the_watchdogs_time():
         await rig.out.count(3)
         rig.emulator.inject("stuck", "on")
         before = rig.clock.now()
-        with pytest.raises(DeviceTimeoutError, match=r"no picture for 2\.0 s"):
+        with pytest.raises(DeviceTimeoutError, match=r"no image for 2\.0 s"):
             await task
         assert (rig.clock.now() - before) / SECOND == pytest.approx(2.0, abs=0.1)
         rig.emulator.inject("stuck", "off")
@@ -214,7 +214,7 @@ def test_a_camera_that_sends_only_garbage_ends_the_session_too():
         task = asyncio.create_task(rig.session())
         await rig.out.count(3)
         rig.emulator.inject("truncate", "1000")
-        with pytest.raises(ProtocolError, match=r"30 pictures in 2\.0 s, none whole"):
+        with pytest.raises(ProtocolError, match=r"30 images in 2\.0 s, none complete"):
             await task
 
     on_bench(test, rate=15.2)  # the limit lies between two pictures

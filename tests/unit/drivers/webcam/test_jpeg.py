@@ -36,9 +36,9 @@ def test_missing_tables_are_put_in():
         (picture()[:-1], "do not end"),
         (picture() + b"\x01", "do not end"),
         (picture()[2:], "instead of FF D8"),
-        (b"\xff\xd8\xff\xd9", "header breaks off"),
-        (b"\xff\xd8\xff\xda\x00\x02\xff\xd9", "header breaks off"),
-        (picture()[:300] + b"\xff\xd9", "header breaks off"),
+        (b"\xff\xd8\xff\xd9", "header ends at"),
+        (b"\xff\xd8\xff\xda\x00\x02\xff\xd9", "header ends at"),
+        (picture()[:300] + b"\xff\xd9", "header ends at"),
     ],
 )
 def test_what_is_no_whole_picture_is_refused(data: bytes, text: str):

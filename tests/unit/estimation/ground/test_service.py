@@ -157,7 +157,7 @@ def test_a_damaged_grid_is_an_event_and_the_ground_unknown(tmp_path):
 
     ((reason, _, source, text),) = run_virtual(main)
     assert (reason, source) == (Reason.FILE_DAMAGED, "ground")
-    assert text.endswith("; the ground counts as unknown")
+    assert text.endswith("; the ground is treated as unknown")
 
 
 def test_a_folder_that_cannot_be_written_is_an_event(tmp_path):

@@ -203,7 +203,7 @@ def test_what_cannot_be_read_is_not_written_over_and_the_last_mark_is_kept(tmp_p
 
     rig = run_scenario(story, tmp_path, load=tmp_path)
     assert (tmp_path / "points.json").read_text() == "[{}]"
-    assert any("not saved over it" in text for _, text in rig.events)
+    assert any("not saved over this file" in text for _, text in rig.events)
     run_scenario(story, tmp_path / "new")
     assert [point.name for point, _ in files.load(tmp_path / "new")] == ["dock"]
 

@@ -177,7 +177,7 @@ def test_a_tag_of_a_saved_map_is_seen_after_a_restart_of_the_computer_and_no_one
         ({"covariance": [1e-320, 0, 0, 0, 1e-320, 0, 0, 0, 1]}, "dock: covariance: expected"),
         ({"covariance": [math.inf, 0, 0, 0, 1, 0, 0, 0, 1]}, "dock: covariance: expected"),
         ({"covariance": [-1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]}, "dock: covariance: expected"),
-        ({}, "dock: expected every name once"),
+        ({}, "dock: expected unique names"),
     ],
 )
 def test_a_file_of_points_that_is_wrong_is_refused_with_the_place(tmp_path, change: dict, said: str):

@@ -58,7 +58,7 @@ def test_a_map_is_published_as_the_robots():
     [
         ({"nonce": "n0"}, Reason.BAD_NONCE, ""),
         ({"role": Role.TRACKER}, Reason.BAD_ROLE, ""),
-        ({"packed": b"no zlib"}, Reason.BAD_INPUT, "map: packed: "),
+        ({"packed": b"no zlib"}, Reason.BAD_INPUT, "map: compressed data: "),
         ({"packed": zlib.compress(bytes(5))}, Reason.BAD_INPUT, "map: 5 of 6 cells"),
         ({"packed": zlib.compress(bytes(10**8), 9)}, Reason.BAD_INPUT, "map: more than 6 cells"),
         ({"packed": zlib.compress(b"\x65" * 6)}, Reason.BAD_INPUT, "map: cells: expected -1 to 100"),

@@ -142,7 +142,7 @@ def test_a_join_that_is_undone_is_a_warning_of_its_own(monkeypatch, tmp_path: Pa
 
     said = events_of(story, monkeypatch, tmp_path)
     assert [reason for reason, _ in said] == [Reason.LOOP_CLOSED, Reason.JOIN_UNDONE, Reason.POSE_LOST]
-    assert said[1][1] == "what was seen since then contradicts it"
+    assert said[1][1] == "later scans contradict it"
 
 
 def test_a_fault_of_the_lidars_mount_is_reported_once(monkeypatch, tmp_path: Path):

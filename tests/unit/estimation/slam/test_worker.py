@@ -95,7 +95,7 @@ def test_a_map_without_a_scan_ends_with_a_sentence(tmp_path: Path):
     worker.step(WorkerInput(start=Start(SlamConfig())))
     done = worker.step(WorkerInput(finish=True, whole=True, save=tmp_path / "map", trajectory=True))
     assert done.saved is None
-    assert done.error == f"{tmp_path / 'map'}: nothing is mapped yet"
+    assert done.error == f"{tmp_path / 'map'}: the map is still empty"
     assert not (tmp_path / "map").exists()
 
 

@@ -89,7 +89,7 @@ def test_a_leader_that_was_never_heard_and_one_that_is_too_far_end_it():
     behaviour = LeaderFollower(FollowConfig(leader="bob"), BODY)
     peers = heard((0.0, 0.0, 0.0), (0.0, 0.0), 1.0, now=1.0)
     inputs = Inputs({POSE.name: odometry(), PEERS.name: peers})
-    assert behaviour.step(inputs, behaviour.begin(), 0.0).text == "bob was not heard yet"
+    assert behaviour.step(inputs, behaviour.begin(), 0.0).text == "no pose of bob received yet"
     far = run(lambda t: (0.0, 0.0), start=(-7.0, 0.0, 0.0))[-1][1]
     assert far.outcome is Reason.PATH_LOST
     assert "7.0 m away" in far.text

@@ -147,7 +147,7 @@ def test_a_silent_sonar_and_a_stalled_motor_end_it_with_their_reason():
 def test_a_sonar_that_stays_the_same_ends_it():
     done = drive(follower(), Robot(HALL, (0.1, -0.1, 0.3), stuck={"l": 0.4}), 5.0)
     assert done.outcome is Reason.INPUT_CONTRADICTORY
-    assert "sonar l measured 0.400 m all along" in done.steps[-1].text
+    assert "sonar l measured a constant 0.400 m" in done.steps[-1].text
 
 
 def test_yaw_that_nobody_asked_for_ends_it():
@@ -161,7 +161,7 @@ def test_yaw_that_nobody_asked_for_ends_it():
             break
         robot.move()
     assert step.outcome is Reason.STUCK
-    assert "does a motor stall" in step.text
+    assert "check for a stalled motor" in step.text
     assert 20 < i < 28
 
 
@@ -270,7 +270,7 @@ def along(walls, far, steps):
 def test_a_sonar_that_measures_another_wall_than_its_neighbour_ends_it():
     step, way = along([(-9.0, 0.35, 9.0, 0.35)], lambda i: {"fl": 2.0 + 0.002 * i}, 100)
     assert step.outcome is Reason.INPUT_CONTRADICTORY
-    assert step.text == "sonar fl does not measure the wall that its neighbour does"
+    assert step.text == "sonar fl does not detect the wall that its neighbour measures"
     assert 1.1 < way < 1.4
 
 
@@ -287,4 +287,4 @@ def test_it_does_not_turn_away_from_what_is_too_near():
     state = behaviour.step(robot.inputs(), behaviour.begin(), 0.0).state
     step = behaviour.step(robot.inputs(), state._replace(phase="turn", w=STANDSTILL), PERIOD)
     assert step.outcome is Reason.STUCK
-    assert step.text == "sonar fl measures 0.15 m: too near to turn away"
+    assert step.text == "sonar fl measures 0.15 m: too close to turn away"

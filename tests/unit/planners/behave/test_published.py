@@ -142,7 +142,7 @@ def test_a_robot_that_turns_once_around_without_a_wall_to_follow_gives_up():
     post = [(0.35, -0.1, 0.35, 0.1)]
     run = drive(WallPd(WallPdConfig()), Robot(post, (0.0, 0.0, 0.0)), 60.0)
     assert run.outcome is Reason.STUCK
-    assert "once around" in run.steps[-1].text
+    assert "a full circle" in run.steps[-1].text
 
 
 def test_a_robot_that_stands_still_does_not_make_a_constant_range_wrong():

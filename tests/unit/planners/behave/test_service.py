@@ -224,7 +224,7 @@ def test_a_goal_or_a_path_that_is_followed_excludes_it():
         assert "goal 3 of bob" in str(goal)
         bench.say_goal(GoalPhase.IDLE)
         bench.say_tracker(Reason.DRIVING)
-        assert str(refused(bench)) == "the path 'bend' is followed"
+        assert str(refused(bench)) == "the tracker follows the path 'bend'"
         bench.mode = GateMode.DISARMED
         await bench.clock.sleep(0.2)
         bench.say_tracker(Reason.DRIVING)
@@ -261,9 +261,11 @@ def test_it_needs_an_armed_robot_and_ends_when_it_is_disarmed(mode):
 @pytest.mark.parametrize("settings", [{"kind": "move"}, {"rate": 50.0}, {"spede": 0.1}])
 def test_a_run_takes_its_settings_but_no_kind_nor_rate_of_its_own(settings):
     async def scenario(bench):
-        with pytest.raises(InputError, match=rf"settings\.{next(iter(settings))}: no setting of a run of wall_pd"):
+        with pytest.raises(
+            InputError, match=rf"settings\.{next(iter(settings))}: not a setting of wall_pd for one run"
+        ):
             bench.start(settings=settings)
-        with pytest.raises(InputError, match=r"no setting of a run of wall_pd"):
+        with pytest.raises(InputError, match=r"not a setting of wall_pd for one run"):
             bench.service.check("wall", settings)
         bench.mode = GateMode.DISARMED
         await bench.clock.sleep(0.2)

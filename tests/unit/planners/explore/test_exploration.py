@@ -321,7 +321,7 @@ def test_where_the_start_is_blocked_a_place_beside_it_is_home():
     assert stepped.actions == (Go((1.6, 2.0, 0.5)),)
     stepped.step(ended=Reason.GOAL_REACHED)
     assert stepped.saved().outcome is Reason.EXPLORED
-    assert "0.6 m from the start, which the map does not show as free" in stepped.run.text
+    assert "0.6 m from the start, which is not free in the map" in stepped.run.text
 
 
 def test_a_robot_that_stands_beside_its_blocked_start_is_back():
@@ -331,7 +331,7 @@ def test_a_robot_that_stands_beside_its_blocked_start_is_back():
     stepped.step()
     stepped.step(ended=Reason.GOAL_BLOCKED)
     assert stepped.saved().outcome is Reason.EXPLORED
-    assert "0.9 m from the start, which the map does not show as free" in stepped.run.text
+    assert "0.9 m from the start, which is not free in the map" in stepped.run.text
 
 
 def test_without_a_map_or_a_place_to_save_it_says_so():

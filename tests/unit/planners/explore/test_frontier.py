@@ -95,7 +95,7 @@ def test_a_place_has_changed_where_a_cell_became_known_or_occupied_nearby():
     ("grid", "text"),
     [
         (grid_of(np.zeros((4, 4)), resolution=0.1), "cells of 0.05 m"),
-        (grid_of(np.zeros((4, 4)), yaw=0.1), "not turned"),
+        (grid_of(np.zeros((4, 4)), yaw=0.1), "without rotation"),
         (grid_of(np.zeros((4, 4)), x=0.02), "whole cells"),
     ],
 )

@@ -68,7 +68,7 @@ def test_the_policy_of_a_step_counts_before_that_of_the_mission():
     assert (following, at.returning) == ("return", True)
     back, following = after(at, DONE)
     assert following == "ended"
-    assert outcome(back, following).text.endswith("walls, back where it began")
+    assert outcome(back, following).text.endswith("walls, back at its start")
     assert outcome(back, following).reason is Reason.GOAL_UNREACHABLE
 
 
@@ -84,7 +84,7 @@ def test_a_way_back_that_fails_too_is_reported_with_what_made_it_drive_back(reas
     assert (following, at.failures) == ("ended", 1)
     end = outcome(at, following)
     assert end.reason is reason
-    assert end.text == "step 2 of 2 (goto 1 0 0): walls; not back where it began: a box"
+    assert end.text == "step 2 of 2 (goto 1 0 0): walls; not back at its start: a box"
 
 
 def test_points_that_were_looked_for_and_found_are_no_failure():
@@ -152,7 +152,7 @@ class Behaviours:
         if name != "wall":
             raise NotFoundError(f"no behaviour {name!r}: expected one of wall")
         if wrong := settings.keys() - {"distance"}:
-            raise InputError(f"settings.{min(wrong)}: no setting of a run of wall_pd")
+            raise InputError(f"settings.{min(wrong)}: not a setting of wall_pd for one run")
 
     def say(self, number: int, running: bool, reason: Reason, source: str = "missions") -> None:
         now = self._robot.clock.now()
@@ -458,7 +458,7 @@ def test_interrupted_on_its_way_back_it_goes_on_back(tmp_path: Path):
     robot = played(resumed, file)
     assert robot.goals == [(5.0, 6.0)]
     assert robot.reports[-1].outcome is Reason.GOAL_UNREACHABLE
-    assert robot.reports[-1].text.endswith(", back where it began")
+    assert robot.reports[-1].text.endswith(", back at its start")
 
 
 def test_stopped_it_cancels_its_goal():
@@ -515,7 +515,7 @@ def test_the_limit_of_a_step_does_not_run_while_its_goal_is_paused():
         assert robot.reports[-1].step == 1
         robot._say(GoalPhase.DRIVING, Reason.DRIVING)
         await robot.clock.sleep(3.0)
-        assert (robot.reports[-1].step, robot.reports[-1].failed) == (2, "not done within 3 s")
+        assert (robot.reports[-1].step, robot.reports[-1].failed) == (2, "not finished within 3 s")
 
     played(story)
 
@@ -591,7 +591,7 @@ def test_progress_that_cannot_be_kept_is_named_by_what_the_disk_says(tmp_path: P
         await robot.clock.sleep(1.0)
 
     robot = played(story, tmp_path / "mission.json")
-    assert {reason for reason, text in robot.events if "progress not kept" in text} == {reason}
+    assert {reason for reason, text in robot.events if "progress not saved" in text} == {reason}
 
 
 @pytest.mark.parametrize("localised", [False, True])
@@ -630,7 +630,7 @@ def test_an_interrupted_mission_can_be_given_up(tmp_path: Path):
 
     robot = played(story, file)
     assert not file.exists()
-    assert robot.events[-1] == (Reason.CANCELLED, "round: given up by ann")
+    assert robot.events[-1] == (Reason.CANCELLED, "round: abandoned by ann")
 
 
 @pytest.mark.parametrize("latency", [0.0, 0.3])
@@ -733,7 +733,7 @@ def test_settings_that_a_behaviour_does_not_take_are_named_before_it_sets_off():
     wrong, right = ({"do": "behaviour", "name": "wall", "settings": {key: 0.3}} for key in ("distanse", "distance"))
 
     async def story(robot: Pretended) -> None:
-        with pytest.raises(InputError, match=r"^step 2: settings\.distanse: no setting of a run of wall_pd$"):
+        with pytest.raises(InputError, match=r"^step 2: settings\.distanse: not a setting of wall_pd for one run$"):
             robot.order(MissionOrder.START, GO, wrong)
         with pytest.raises(InputError, match=r"^step 1: settings\.distanse: .*; step 2: no behaviour 'left'"):
             robot.order(MissionOrder.START, wrong, {"do": "follow_wall", "name": "left", "distance": 1.0})
@@ -823,7 +823,7 @@ def test_the_limit_of_an_outer_step_cancels_what_runs():
 
     robot = played(story)
     assert robot.reports[-1].outcome is Reason.MISSION_DONE
-    assert (Reason.TIMEOUT, "step 1.1.2 of 1: goto 1 0 0: not done within 3.5 s") in robot.events
+    assert (Reason.TIMEOUT, "step 1.1.2 of 1: goto 1 0 0: not finished within 3.5 s") in robot.events
 
 
 @pytest.mark.parametrize(("change", "reason"), [("points", Reason.MISSION_DONE), ("gate", Reason.DISARMED)])

@@ -101,7 +101,7 @@ def test_a_loop_ends_by_its_number_or_its_condition():
     assert run.end().place == ("2", "goto 3")
     run = Run({"do": "repeat", "until": LOW, "times": 2, "steps": [go(1)]}).end().end()
     assert run.next == "ended"
-    assert outcome(run.at, run.next).text.endswith("after 2 rounds: battery below 20 % does not hold")
+    assert outcome(run.at, run.next).text.endswith("after 2 rounds: battery below 20 %: not fulfilled")
 
 
 def test_a_branch_chooses_when_it_is_reached():
@@ -263,7 +263,7 @@ def test_what_the_robot_lacks_is_found_in_any_depth():
     assert lacking(mission(*steps), Abilities()) == []
     known = Abilities(known=frozenset({"door"}))
     (unknown,) = lacking(mission(*steps), known)
-    assert unknown.text == "no point of interest 'dock' is known and no step explores: known are door"
+    assert unknown.text == "point of interest 'dock' is unknown and no step explores: known are door"
     assert lacking(mission(*steps, {"do": "explore"}), known) == [], "it may be found"
 
 

@@ -138,7 +138,7 @@ def test_what_touches_and_goals_within_the_margin_are_refused(planner):
     for start in (base_beside("parallel", 0.02), base_beside("facing", 0.005), GOAL):
         result = planner.plan(where, start, beside)
         assert result.reason is Reason.GOAL_BLOCKED
-        assert "nearer than" in result.text
+        assert "closer than" in result.text
     outside = planner.plan(where, base_beside("parallel", 0.02), np.array([50.0, 2.0, 0.0]))
     assert outside.reason is Reason.GOAL_OUTSIDE
 
@@ -176,7 +176,7 @@ def test_departures_are_part_of_the_budget_and_say_when_it_ends(planner):
     start, config = np.array([3.0, 1.1, 0.0]), HybridConfig(margin=MARGIN)
     result = planner.plan(shut_in, start, GOAL)
     assert result.reason is Reason.ROUTE_TIMEOUT
-    assert "no way found in time" in result.text
+    assert "no route found in time" in result.text
     for reserve, share in ((0.0, 0.5), (0.5, 0.25)):
         budget = Budget(1.0, None, 2000)
         assert not departures(shut_in, TRUCK, start, config, budget, reserve).exhausted

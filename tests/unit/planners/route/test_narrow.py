@@ -39,7 +39,7 @@ def test_a_footprint_fits_where_a_heading_is_free(vehicle, yaw):
 def test_a_gap_too_narrow_by_less_than_a_cell_is_no_way_and_soon_known():
     result = planner(margin=0.05, narrow_margin=0.05).plan(ground(*DOOR), START, GOAL)
     assert result.reason is Reason.GOAL_UNREACHABLE
-    assert result.text == "no way 0.47 m wide leads there"
+    assert result.text == "no passage 0.47 m wide leads there"
     assert result.statistics["expanded"] < 1000
 
 
@@ -66,7 +66,7 @@ def test_less_margin_where_there_is_no_other_way():
 def test_how_narrow_a_door_may_be_is_a_setting():
     where = ground((2.9, 0.0, 3.1, 1.8), (2.9, 2.2, 3.1, 4.0))  # 2 cm on either side
     refused = planner(margin=0.04).plan(where, START, GOAL)
-    assert (refused.reason, refused.text) == (Reason.GOAL_UNREACHABLE, "no way 0.43 m wide leads there")
+    assert (refused.reason, refused.text) == (Reason.GOAL_UNREACHABLE, "no passage 0.43 m wide leads there")
     result = planner(margin=0.04, narrow_margin=0.01).plan(where, START, GOAL)
     assert result.ok
     assert where.field.free(TRUCK.footprint, result.path.sample(0.02).poses, 0.01).all()

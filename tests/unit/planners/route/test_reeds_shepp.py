@@ -148,5 +148,5 @@ def test_nonsense_is_refused():
         MotionPath(np.zeros(3), np.ones((2, 3)), ("front",))
     with pytest.raises(InputError, match="step"):
         CAR.path((0, 0, 0), (1, 0, 0)).sample(0.0)
-    with pytest.raises(InputError, match="start where"):
+    with pytest.raises(InputError, match="start at the end"):
         CAR.path((0, 0, 0), (1, 0, 0)).then(CAR.path((0, 0, 0), (1, 0, 0)))

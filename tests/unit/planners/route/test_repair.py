@@ -67,5 +67,5 @@ def test_a_turn_that_would_touch_something_is_refused():
 
 def test_laps_are_mended_by_hand():
     square = [(0, 0), (2, 0), (2 - 2 * math.cos(0.5), 2 * math.sin(0.5))]
-    with pytest.raises(InputError, match="mended by hand"):
+    with pytest.raises(InputError, match="repaired by hand"):
         repaired(path(square, closed=True), CONFIG, GEOMETRY)

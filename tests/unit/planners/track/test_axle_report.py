@@ -47,7 +47,7 @@ def test_at_one_speed_neither_servo_nor_slip_is_blamed_and_no_calibration_advise
 
 def test_another_speed_tells_slip_from_the_servo():
     slip = reported(AxleErrors(AxleError(compliance=0.03), AxleError(compliance=0.03)), (0.3, 1.2), steering=FRONT)
-    assert slip.text.startswith("front steers 1.7 degrees less for each m/s^2 sideways, by slip")
+    assert slip.text.startswith("front steers 1.7 degrees less for each m/s^2 of lateral acceleration, by slip")
     assert not any(row.servo_differs for row in slip.axles)
     servo = reported(AxleErrors(AxleError(0.85)), (0.3, 1.2), steering=FRONT)
     assert servo.text == "front steers 15 % less than calibrated: `calibrate steering`"

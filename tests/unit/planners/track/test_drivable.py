@@ -105,6 +105,6 @@ def test_the_least_deviation_is_what_pure_pursuit_shows(degrees, accepted):
 
 def test_front_steering_has_twice_the_radius():
     assert least_radius("front", 0.362, GEOMETRY) == pytest.approx(2 * least_radius("hybrid", 0.362, GEOMETRY))
-    with pytest.raises(InputError, match=r"least radius is 0\.85 m"):
+    with pytest.raises(InputError, match=r"minimum radius of 0\.85 m"):
         require(path(arc(0.5, 180)), steering="front")
     require(path(arc(0.5, 180)))

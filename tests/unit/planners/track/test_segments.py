@@ -114,5 +114,5 @@ def test_steps_of_micrometres_that_lead_back_make_no_step_of_length_0():
     run = segmented(path([*there_and_back, (1.0, 0.0)])).runs[0]
     assert run.length == pytest.approx(1.0)
     assert run.at(0.0).point == (0.0, 0.0)
-    with pytest.raises(InputError, match="one place"):
+    with pytest.raises(InputError, match="one position"):
         segmented(path(there_and_back))

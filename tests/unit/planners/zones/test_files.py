@@ -66,7 +66,7 @@ def test_a_keepout_mask_closes_what_is_lethal_in_nav2_and_remarks_on_the_rest(tm
     (zone,), remarks = files.configured(ZonesConfig(keepout_mask=KeepoutMaskConfig(map=scale)), 0.5)
     assert limits_of(zone.mask).tolist() == [[0.0]]
     assert "1 cells of values 1 to 99" in remarks[0]
-    with pytest.raises(InputError, match=r"mask\.yaml: not one cell of a zone"):
+    with pytest.raises(InputError, match=r"mask\.yaml: contains no zone cells"):
         files.configured(ZonesConfig(keepout_mask=KeepoutMaskConfig(map=mask_file(tmp_path, [[255]]))), 0.5)
 
 

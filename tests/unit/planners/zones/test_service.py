@@ -136,7 +136,7 @@ def test_a_zone_is_off_for_a_while_or_until_it_is_turned_on():
     stage = play(story, stairs=AREA)
     assert stage.reported() == [Reason.ZONE_OFF, Reason.ZONE_ON, Reason.ZONE_OFF, Reason.ZONE_ON]
     assert stage.events[0][1] == "keepout zone stairs is off for 5 s, by ann"
-    assert stage.events[1][1] == "zone stairs is on: its time off is over"
+    assert stage.events[1][1] == "zone stairs is on: its time off has expired"
 
 
 def test_the_zones_that_the_robot_is_in_are_said_once_each():
@@ -153,7 +153,7 @@ def test_the_zones_that_the_robot_is_in_are_said_once_each():
 def test_what_cannot_be_done_is_refused_and_changes_nothing(tmp_path):
     async def story(stage):
         for order, name, error, said in (
-            (ZoneOrder.REMOVE, "ramp", InputError, "belongs to the configuration: expected to be removed there"),
+            (ZoneOrder.REMOVE, "ramp", InputError, "is defined in the configuration: expected to be removed there"),
             (ZoneOrder.OFF, "yard", NotFoundError, "no zone 'yard': expected one of ramp"),
             (ZoneOrder.ADD, "yard", InputError, "area: expected"),
         ):

@@ -317,7 +317,7 @@ async def test_a_worker_that_dies_or_raises_is_replaced():
         assert await worker.step(None) == 1
         assert worker.pid is not None
         os.kill(worker.pid, signal.SIGKILL)
-        with pytest.raises(WorkerError, match=r"is gone: killed by SIGKILL, as by a system that is short of memory$"):
+        with pytest.raises(WorkerError, match=r"is gone: killed by SIGKILL, as by the out-of-memory killer$"):
             await worker.step(None)
         assert await worker.step(None) == 1
 

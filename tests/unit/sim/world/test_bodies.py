@@ -149,7 +149,7 @@ def test_tyres_with_inertia_stop_at_a_wall(field):
 
 @pytest.mark.parametrize("kind", ["differential", "mecanum", "synchro"])
 def test_bodies_without_steered_axles_have_no_single_track(kind):
-    with pytest.raises(ValidationError, match=f"body {kind} has no axles that steer it into a curve"):
+    with pytest.raises(ValidationError, match=f"body {kind} has no steered axles for curves"):
         SimTruckConfig.model_validate({"body": {"kind": kind}, "dynamics": "single_track"})
 
 

@@ -113,7 +113,7 @@ def test_an_obstacle_of_one_is_an_obstacle_of_all():
     [
         (((0.0, 0.0, 0.0), (0.3, 0.1, 1.0)), (), "robots robot_0 and robot_1 overlap"),
         (((0.0, 0.0, 0.0),), (walk((0.1, 0.0), (2.0, 0.0)),), "robot robot_0 and person 1 overlap"),
-        (((0.0, 0.0, 0.0),), (walk((1.0, 0.0), (9.0, 0.0)),), r"sim.world.people.0: the way from .* is not free"),
+        (((0.0, 0.0, 0.0),), (walk((1.0, 0.0), (9.0, 0.0)),), r"sim.world.people.0: the path from .* touches occupied"),
     ],
 )
 def test_who_stands_in_each_other_is_refused(starts, people, said):

@@ -172,7 +172,7 @@ def test_a_sonar_that_the_robot_has_not(field):
 
 
 def test_the_range_limits_have_to_rise():
-    with pytest.raises(ValueError, match="expected them to rise"):
+    with pytest.raises(ValueError, match="expected increasing values"):
         SonarModelConfig(range_min=3.0, range_max=2.0)
 
 

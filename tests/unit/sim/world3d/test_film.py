@@ -85,7 +85,7 @@ def test_a_film_of_a_run_that_failed_is_kept_and_one_that_is_broken_off_is_not(
 
 def test_only_rigid_worlds_and_gifs_are_filmed(tmp_path):
     async def main(clock: VirtualClock) -> None:
-        with pytest.raises(InputError, match=r"only sim\.world\.engine mujoco can be filmed"):
+        with pytest.raises(InputError, match=r"needs sim\.world\.engine mujoco"):
             Film(World(WorldConfig(map="yard"), 1), clock, tmp_path / "a.gif")
         with pytest.raises(InputError, match=r"expected a name that ends with \.gif"):
             Film(World(WorldConfig(engine="mujoco", map="yard"), 1), clock, tmp_path / "a.mp4")

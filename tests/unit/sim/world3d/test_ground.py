@@ -82,7 +82,7 @@ def test_a_pictures_upper_row_is_its_far_side(tmp_path, dtype, white):
 
 def test_what_is_no_picture_is_refused(tmp_path):
     (tmp_path / "hill.png").write_text("no picture")
-    with pytest.raises(InputError, match=r"hill\.png: expected a picture of heights \(sim\.world\.height_image\)"):
+    with pytest.raises(InputError, match=r"hill\.png: expected a height image \(sim\.world\.height_image\)"):
         heights(height_image={"file": tmp_path / "hill.png"})
 
 
@@ -167,9 +167,9 @@ def test_other_files_that_do_not_fit_are_refused(tmp_path, text, reason):
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        ("<default><geom type='box'/></default>", "<default>: expected geometries that say all"),
+        ("<default><geom type='box'/></default>", "<default>: expected geometries with all"),
         ("<compiler eulerseq='zyx'/>", "eulerseq zyx: expected xyz"),
-        ("<worldbody><body><flexcomp name='f'/></body></worldbody>", "<flexcomp>: expected geometries that do not"),
+        ("<worldbody><body><flexcomp name='f'/></body></worldbody>", "<flexcomp>: expected static geometries"),
         ("<worldbody><geom euler='0 0 north'/></worldbody>", "euler '0 0 north': expected numbers"),
     ],
 )

@@ -97,10 +97,10 @@ def test_what_is_missing_is_said_and_named_at_the_end():
         shown(one, view, 2 * k * SECOND)
     missing = one.missing()
     assert {"upper right", "right", "lower right"} <= set(one.uncovered())
-    assert "the board in the right of the picture" in missing
-    assert f"{24 - len(held)} more views of it" in missing
+    assert "the board in the right of the image" in missing
+    assert f"{24 - len(held)} more views of the board" in missing
     assert "16 more views across the lidar's beam" in missing
-    with pytest.raises(InputError, match=r"nothing new in 20 s; still missing: the board in the .*right of"):
+    with pytest.raises(InputError, match=r"no new view in 20 s; still missing: the board in the .*right of"):
         shown(one, held[0], 20 * SECOND, 30.0)
 
 
@@ -111,10 +111,10 @@ def test_views_across_the_beam_have_to_lean_steeply_near_and_far():
     upper, lower = ([view for view in near if sign * view.pose.lean > 0] for sign in (1, -1))
     for view in upper[:8] + lower[:7]:
         one.keep(view)
-    said = "its lower edge nearer by 30 degrees or more, across the lidar's beam (1 more)"
+    said = "its bottom edge closer by 30 degrees or more, across the lidar's beam (1 more)"
     assert [text for text in one.missing() if "degrees" in text] == [said]
     one.keep(lower[7])
-    assert any(text.startswith("it so at more distances, not only 0.4") for text in one.missing())
+    assert any(text.startswith("these tilts at more distances than 0.4") for text in one.missing())
     one.keep(max(steep, key=lambda view: view.pose.place[2]))
     assert not any(word in text for text in one.missing() for word in ("degrees", "it so"))
 
@@ -122,8 +122,8 @@ def test_views_across_the_beam_have_to_lean_steeply_near_and_far():
 @pytest.mark.parametrize(
     ("sightings", "said"),
     [
-        ([None], "no board of 8 x 6 squares is seen in 20 s"),
-        ([BoardSighting(np.zeros((9, 2)), np.arange(9), 3.1)], r"blurred \(edges of 3.1 pixels, expected 2\)"),
+        ([None], "no board of 8 x 6 squares was detected in 20 s"),
+        ([BoardSighting(np.zeros((9, 2)), np.arange(9), 3.1)], r"blurred \(edges 3.1 pixels wide, expected 2\)"),
         ([view.sighting for view in boards(3, 4)], "never held still for 0.7 s"),
     ],
 )
@@ -138,7 +138,7 @@ def test_another_board_is_named():
     one = guide()
     picture = np.pad(printed.generateImage((560, 420)), ((30, 30), (40, 40)), constant_values=255)
     one.reader.read(np.asarray(picture[200:], dtype=np.uint8))
-    with pytest.raises(InputError, match=r"another board is shown: marker [0-9]+ is none of 8 x 6 squares"):
+    with pytest.raises(InputError, match=r"another board: marker [0-9]+ does not belong to 8 x 6 squares"):
         shown_in_turn(one, [None])
 
 
@@ -153,14 +153,14 @@ def test_corners_are_averaged():
 
 def test_too_few_boards_and_boards_that_no_lens_explains_are_refused():
     views = boards(5, 10)
-    with pytest.raises(InputError, match="seen in 3 pictures: expected 6"):
+    with pytest.raises(InputError, match="visible in 3 images: expected 6"):
         fit_lens([view.sighting for view in views[:3]], READER, (640, 480))
     rng = np.random.default_rng(1)
     bent = [
         BoardSighting(v.sighting.corners + rng.normal(0, 3, v.sighting.corners.shape), v.sighting.ids, 0.5)
         for v in views
     ]
-    with pytest.raises(InputError, match=r"corners are off by [0-9.]+ pixels .*not flat"):
+    with pytest.raises(InputError, match=r"corners deviate by [0-9.]+ pixels .*bent"):
         camera.lens_of([SimpleNamespace(sighting=view) for view in bent], READER, (640, 480))
 
 
@@ -275,7 +275,7 @@ async def test_the_lens_alone_leaves_the_mount(session):
 async def test_a_robot_without_a_camera_is_refused(session):
     context, _, _ = session
     context.config = load_config(CONFIGS / "yard.yaml", SimulatedTruckConfig)[0]
-    with pytest.raises(RequestRefusedError, match="no camera whose lens it states"):
+    with pytest.raises(RequestRefusedError, match="no camera whose driver takes lens parameters"):
         await CameraWizard()(context)
 
 
@@ -288,10 +288,10 @@ async def test_a_damaged_picture_now_and_then_does_not_end_it_and_a_camera_that_
     assert (await CameraWizard(lidar=False)(context)).estimate("k1") is not None
     assert camera.decoded(SimpleNamespace(stamp=4 * SECOND)) is None
     monkeypatch.setattr(camera, "decoded", lambda m: whole(m) if m.stamp == 0 else None)
-    with pytest.raises(InputError, match=r"of \d+ pictures cannot be decoded: look at the camera's cable"):
+    with pytest.raises(InputError, match=r"of \d+ images cannot be decoded: check the camera's cable"):
         await CameraWizard(lidar=False)(context)
     monkeypatch.setattr(camera, "decoded", lambda _: None)
-    with pytest.raises(InputError, match="none of 3 pictures"):
+    with pytest.raises(InputError, match="none of 3 images"):
         await CameraWizard(lidar=False)(context)
 
 
@@ -304,7 +304,7 @@ async def test_pictures_of_another_size_are_another_lens(session, monkeypatch: p
     context, _, _ = session
     whole = camera.decoded
     monkeypatch.setattr(camera, "decoded", lambda m: whole(m)[: 360 if m.stamp > 9 * SECOND else 480])
-    with pytest.raises(InputError, match="were 640 x 480 pixels and are 640 x 360 now"):
+    with pytest.raises(InputError, match="changed from 640 x 480 to 640 x 360 pixels"):
         await CameraWizard(lidar=False)(context)
 
 
@@ -315,7 +315,7 @@ async def test_a_lidar_whose_joints_turn_meanwhile_tells_no_mount(session, after
     devices = context.config.devices.model_copy(update={"stabiliser": stabiliser})
     context.config, context.joints = context.config.model_copy(update={"devices": devices}), [0.0, after]
     if refused:
-        with pytest.raises(InputError, match=r"turned by 1\.7 degrees .* do not lean on it"):
+        with pytest.raises(InputError, match=r"lidar by 1\.7 degrees .* do not lean on it"):
             await CameraWizard()(context)
     else:
         assert (await CameraWizard()(context)).estimate("pitch") is not None

@@ -101,7 +101,7 @@ def test_strength_is_not_observed():
 
 
 def test_part_of_a_circle_is_refused():
-    with pytest.raises(InputError, match=r"not turned all the way round: 1\d\d deg"):
+    with pytest.raises(InputError, match=r"did not complete the circle: 1\d\d deg"):
         result_of(circle(turns=1.1))
 
 
@@ -133,7 +133,7 @@ def test_without_current_there_is_no_map():
 def test_iron_in_the_ground_is_separated_from_the_trucks_own():
     clean = circle()
     beside = 8.0 * np.exp(-(((np.arange(clean.x.size) % 400) - 150) ** 2) / 1800.0)
-    with pytest.raises(InputError, match=r"off the ellipse .* go elsewhere"):
+    with pytest.raises(InputError, match=r"ellipse .* calibrate elsewhere"):
         result_of(replace(clean, x=clean.x + beside))
 
 
@@ -159,15 +159,15 @@ def test_iron_in_the_ground_that_is_not_seen_widens_the_intervals():
 
 def test_a_magnet_that_makes_no_circle_of_it_is_refused_and_gets_no_interval_without_an_end():
     clean = circle()
-    with pytest.raises(InputError, match="a magnet is near the compass"):
+    with pytest.raises(InputError, match="a magnet near the compass"):
         result_of(replace(clean, y=0.1 * clean.y))
 
 
 def test_a_heading_that_stays_and_too_few_readings_are_named():
-    with pytest.raises(InputError, match="stays the same while the robot turns"):
+    with pytest.raises(InputError, match="stays constant while the robot turns"):
         result_of(replace(circle(), heading=np.zeros(800)))
     record = MoveRecord(others={topics.COMPASS.name: [reading(100 + i, i) for i in range(9)]}, left=99, arrived=200)
-    with pytest.raises(InputError, match="18 readings of the compass while the robot moved: expected 24"):
+    with pytest.raises(InputError, match="sent 18 readings while the robot moved: expected 24"):
         FieldCircle.of([record, record])
 
 

@@ -53,14 +53,14 @@ def test_the_tape_measures_the_chord_of_a_bend():
 
 
 def test_a_crooked_run_measures_nothing():
-    with pytest.raises(InputError, match=r"turned by 29 deg on its way: run `calibrate steering --rough` first"):
+    with pytest.raises(InputError, match=r"turned by 29 deg during the run: run `calibrate steering --rough` first"):
         TapedRun.of(track(2732.0, 0.5), 2.0)
 
 
 def test_no_headings_at_rest():
     short = track(2732.0)
     short.attitude = short.attitude[:-18]
-    with pytest.raises(InputError, match="20 and 2 headings of the compass at rest: expected 5"):
+    with pytest.raises(InputError, match="20 and 2 compass headings at rest: expected 5"):
         TapedRun.of(short, 2.0)
 
 
@@ -102,11 +102,11 @@ def test_without_a_compass_the_operator_judges_the_bend_and_the_result_says_so()
     assert len(course.said) == 1
     turns = result.estimate("turns_per_metre")
     assert turns.low < 2732.0 / (2.0 * 1.0051) < 2732.0 / 2.0 < turns.high
-    assert "0.26% of the bends" in turns.meaning
+    assert "0.26% for curved runs" in turns.meaning
 
 
 def test_without_a_compass_a_run_that_looks_crooked_measures_nothing():
-    with pytest.raises(InputError, match="more than 20 deg on its way: set the middle of its servos"):
+    with pytest.raises(InputError, match="more than 20 deg during the run: set the centre of its servos"):
         TapedRun.of(track(2732.0), 2.0, straight=False)
 
 
@@ -114,6 +114,6 @@ def test_a_silent_compass_is_noticed_before_anything_is_taped():
     move = track(2732.0)
     move.attitude.clear()
     course = Course(move, object())
-    with pytest.raises(InputError, match="only 0 and 0 headings of the compass at rest"):
+    with pytest.raises(InputError, match="only 0 and 0 compass headings at rest"):
         asyncio.run(DriveWizard()(course))
     assert course.asked == ["clear", "forward"]

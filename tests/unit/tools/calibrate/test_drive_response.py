@@ -62,5 +62,5 @@ def test_setting_off_and_stopping_are_kept_apart():
 
 
 def test_a_run_without_readings_is_refused():
-    with pytest.raises(InputError, match="start: no run with 8 readings"):
+    with pytest.raises(InputError, match="start: no run has 8 readings"):
         drive_estimates([MoveRecord()], 20.0)

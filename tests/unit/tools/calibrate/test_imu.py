@@ -56,7 +56,7 @@ def test_a_unit_that_is_moved_is_refused():
 def test_the_scale_makes_a_full_turn_one():
     turns = [Turn(1.04 * side * 6.3 + 0.005 * 20, 20.0, side * 6.3, 0.003) for side in (1, -1)]
     assert rate_scale(turns, Interval(0.005, 0.0005)).value == pytest.approx(1 / 1.04, rel=1e-4)
-    with pytest.raises(InputError, match="one to each side"):
+    with pytest.raises(InputError, match="one in each direction"):
         rate_scale(turns[:1] * 2, Interval(0.0, 0.001))
 
 

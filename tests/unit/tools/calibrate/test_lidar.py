@@ -50,7 +50,7 @@ def test_a_truck_that_may_crab_widens_the_yaw_alone():
 
 
 def test_arcs_to_one_side_are_refused():
-    with pytest.raises(InputError, match="arcs to both sides"):
+    with pytest.raises(InputError, match="two arcs in each direction"):
         result_of(
             [replace(leg, seen=(leg.seen[0], leg.seen[1], abs(leg.seen[2]))) for leg in LEGS], (0, 0, 0), 0.01, None
         )
@@ -77,7 +77,7 @@ def test_the_tilt_of_the_beam_follows_from_its_heights():
 
 @pytest.mark.parametrize(("heights", "named"), [((0.25, 2.5, 0.25), "ahead"), ((0.25, 0.25, 1.8), "left")])
 def test_heights_that_no_lidar_has_are_refused_by_name(heights, named):
-    with pytest.raises(InputError, match=rf"^{named}: a beam 25 cm at .* measure again, in cm"):
+    with pytest.raises(InputError, match=rf"^{named}: a beam 25 cm high at .* measure again, in cm"):
         beam_tilt(heights, (2.0, 2.0))
     assert all(step.low == 1.0 for step in HEIGHTS), "metres in place of cm are refused, too"
 

@@ -44,9 +44,9 @@ def test_an_expired_lease_says_what_to_do():
     assert str(stopped(mode=GateMode.ARMED)) == str(error), "armed, and nobody drives: the lease is gone already"
     assert error.refusal is Reason.LEASE_EXPIRED
     assert str(error).startswith(
-        "stopped by the gate: no fresh drive request within its lease; requests came too late:"
+        "stopped by the gate: no fresh drive request within its lease; drive requests arrived too late:"
     )
-    assert "repeat it; nothing was saved" in str(error)
+    assert "repeat it (nothing was saved)" in str(error)
 
 
 def test_a_silent_device_says_what_to_do_once():
@@ -177,8 +177,8 @@ def test_after_a_stop_that_passed_it_drives_back_and_once_more():
     assert truck.x == pytest.approx(1.0, abs=0.05)
     assert record.distance(DriveTrain()) == pytest.approx(1.0, abs=0.05), "of the last one alone"
     assert said == [
-        "run: no fresh lidar scan; back to where it began, and once more",
-        "run: no fresh drive request within its lease; back to where it began, and once more",
+        "run: no fresh lidar scan; returning to the start for another attempt",
+        "run: no fresh drive request within its lease; returning to the start for another attempt",
     ]
 
 

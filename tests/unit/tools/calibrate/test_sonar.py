@@ -45,12 +45,14 @@ def test_all_places_and_no_other_key_are_found():
 
 @pytest.mark.parametrize(("first", "second"), [("l", "r"), ("fl", "fr"), ("l", "fl"), ("f", "r")])
 def test_swapped_cables_are_named(first, second):
-    with pytest.raises(InputError, match=f"{first} hears the echoes due at {second}, {second} hears .* at {first}"):
+    with pytest.raises(
+        InputError, match=f"{first} receives the echoes expected at {second}, {second} receives .* at {first}"
+    ):
         result_of(legs(swapped(first, second)), SETTINGS, WALL, 0.002)
 
 
 def test_a_wall_that_is_elsewhere_is_no_swap():
-    with pytest.raises(InputError, match="too few echoes of the wall: is it where it was taped"):
+    with pytest.raises(InputError, match="too few echoes of the wall: check that it is mounted where configured"):
         result_of(legs(), SETTINGS, 2.6, 0.002)
 
 
@@ -97,7 +99,7 @@ def test_pings_are_placed_where_the_robot_was_by_odometry():
 
 def test_short_arcs_and_too_few_echoes_are_refused():
     short = sonar_legs(PLACES, (WALL, 0.0), 0.43, 1.0, np.random.default_rng(1), 0.5)
-    with pytest.raises(InputError, match="arcs of 1 rad at least"):
+    with pytest.raises(InputError, match="arcs of at least 1 rad"):
         result_of(short, SETTINGS, WALL, 0.002)
     deaf = [replace(leg, ranges={**leg.ranges, "f": np.full_like(leg.ranges["f"], np.inf)}) for leg in legs()]
     with pytest.raises(InputError, match="sonar f"):

@@ -51,9 +51,9 @@ def seen(stand, joints):
 def test_swapped_servos_and_a_loose_horn_are_named():
     flat, nose, side = stands()
     for sign in (1, -1):
-        with pytest.raises(InputError, match="pitch and roll servo are swapped"):
+        with pytest.raises(InputError, match="pitch and roll servos are swapped"):
             judge(flat, seen(nose, RollPitch(0.0, sign * nose.joints.pitch)), side)
-        with pytest.raises(InputError, match="pitch and roll servo are swapped"):
+        with pytest.raises(InputError, match="pitch and roll servos are swapped"):
             judge(flat, nose, seen(side, RollPitch(sign * side.joints.roll, 0.0)))
     with pytest.raises(InputError, match="horn of the roll joint is loose"):
         judge(flat, nose, seen(side, RollPitch(0.0, 0.0)))
@@ -63,14 +63,14 @@ def test_blocks_that_are_missing_or_in_the_way_and_joints_that_rest_are_refused(
     flat, nose, side = stands()
     with pytest.raises(InputError, match=r"the nose is 0\.6 deg low: expected 4 to 15"):
         judge(flat, flat, side)
-    with pytest.raises(InputError, match="it does not follow"):
+    with pytest.raises(InputError, match="the joint does not follow"):
         judge(flat, replace(nose, joints=flat.joints), side)
     floor = beams_up(nose.body, nose.body, nose.angles)
     half = np.where(np.arange(floor.size) % 2 == 0, 0.25 / np.maximum(-floor, 0.01), 3.5)
-    with pytest.raises(InputError, match="neither a clear floor nor none"):
+    with pytest.raises(InputError, match="unclear whether it sees the floor"):
         judge(flat, replace(nose, ranges=half), side)
-    with pytest.raises(InputError, match=r"the pitch joint is level at position .* beyond its limits of 510 to 512"):
+    with pytest.raises(InputError, match=r"the pitch joint is level at position .* outside its limits of 510 to 512"):
         result_of(*stands(zeros=(514.0, 204.0)), LOW, WALLS, NARROW, 0.002)
     wall = replace(flat, ranges=np.minimum(flat.ranges, 1.5))
-    with pytest.raises(InputError, match="higher blocks, or more room"):
+    with pytest.raises(InputError, match="use higher blocks or clear more floor"):
         judge(wall, nose, side)

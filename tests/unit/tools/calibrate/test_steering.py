@@ -126,7 +126,7 @@ def test_where_both_axles_seem_to_steer_the_other_way_the_operator_sees_whether_
     )
     wizard = SteeringWizard(rough=True)
     if turned_left:
-        with pytest.raises(InputError, match="the compass the other way"):
+        with pytest.raises(InputError, match="the compass reports the opposite"):
             asyncio.run(wizard(context))  # type: ignore[arg-type]
     else:
         result = asyncio.run(wizard(context))  # type: ignore[arg-type]
@@ -171,7 +171,7 @@ def test_the_moves_that_are_announced_are_those_that_are_made(wizard: SteeringWi
 
 def test_wheels_that_do_not_steer_are_named():
     dead = ([leg(0, 0, d * 0.4, BELIEVED) for d in (1, -1, 1, -1)],) * 2
-    with pytest.raises(InputError, match="front wheels: steered, they turn the robot by"):
+    with pytest.raises(InputError, match="front wheels: steering them turned the robot by"):
         steered_senses(dead)
 
 

@@ -137,7 +137,7 @@ def test_messages_are_collected_within_their_time():
         await context.collect(Collect("voltage", topics.BATTERY, 3, 5.0))
         return RESULT
 
-    with pytest.raises(NoAnswerError, match="sensor/battery: 0 of 3 messages came within 5 s"):
+    with pytest.raises(NoAnswerError, match="sensor/battery: 0 of 3 messages received within 5 s"):
         run(steps, panel, truck)
     assert "voltage 3/3" in panel.said
 
@@ -156,7 +156,9 @@ def test_what_was_measured_on_another_part_is_not_used(part: str | None):
     run(steps, panel, known=known)
     said = [text for text in panel.said if "has expired" in text]
     assert len(said) == (1 if part else 0)
-    assert not part or said[0].startswith("nothing of the calibration before is used, it has expired: steering was mae")
+    assert not part or said[0].startswith(
+        "the previous calibration is ignored because it has expired: steering was mae"
+    )
 
 
 def test_measurements_that_determine_nothing_are_named_and_not_saved():
@@ -165,7 +167,7 @@ def test_measurements_that_determine_nothing_are_named_and_not_saved():
     async def steps(context: WizardContext) -> Result:
         return context.fit("scale", lambda: RESULT.model_copy(update={"date": 1 / 0}))
 
-    with pytest.raises(InputError, match=r"scale: cannot be computed from what was measured .*: measure again"):
+    with pytest.raises(InputError, match=r"scale: cannot be computed from the measurement .*: measure again"):
         run(steps, truck=truck)
 
     async def infinite(context: WizardContext) -> Result:

@@ -28,7 +28,7 @@ def test_degrees_are_the_default_and_radians_are_named(text: str, expected: floa
 
 @pytest.mark.parametrize("text", ["", "deg", "ninety", "90 turns", "90grad"])
 def test_other_words_are_refused(text: str):
-    with pytest.raises(typer.BadParameter, match=r"expected a number of degrees, or 1\.57rad"):
+    with pytest.raises(typer.BadParameter, match=r"expected degrees, or radians such as 1\.57rad"):
         parse_angle(text)
 
 

@@ -73,7 +73,7 @@ async def test_a_result_stands_beside_the_one_before_and_is_saved_when_that_is_a
     assert not truck.saved
     assert await measured.save() == "0002.json"
     assert truck.saved[0]["source"] == "ann.calibrate"
-    with pytest.raises(InputError, match=r"battery\.scale: no such calibration"):
+    with pytest.raises(InputError, match=r"battery\.scale: unknown calibration"):
         await PageCalibrator(WallClock()).measure(truck, "battery.scale", {}, Panel())  # type: ignore[arg-type]
 
 

@@ -31,7 +31,7 @@ def test_the_mjcf_is_a_model_of_the_same_mass():
 def test_a_body_without_description_is_refused():
     result = CliRunner().invoke(app, ["description", str(CONFIGS / "robots" / "synchro.yaml")])
     assert result.exit_code == 3
-    assert "body synchro: has no description" in result.stderr
+    assert "body synchro: cannot be described" in result.stderr
 
 
 def test_the_small_robot_has_masses_of_its_own_and_those_of_the_truck_are_refused(tmp_path):
@@ -41,7 +41,7 @@ def test_the_small_robot_has_masses_of_its_own_and_those_of_the_truck_are_refuse
     heavy.write_text(f"version: 2\ninclude: {small}\nsim: {{ world: {{ mechanics: {{ wheel_mass: 0.281 }} }} }}\n")
     result = CliRunner().invoke(app, ["description", str(heavy)])
     assert result.exit_code == 3
-    assert result.stderr.startswith("sim.world.mechanics: mass is 0.6: expected more than wheels and axles together")
+    assert result.stderr.startswith("sim.world.mechanics: mass is 0.6: expected more than the wheels and axles")
 
 
 @pytest.mark.parametrize("robot", ["sonar", "omni"])

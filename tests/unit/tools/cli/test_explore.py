@@ -98,7 +98,7 @@ def test_what_it_waits_for_is_said():
     )
     lines: list[str] = []
     asyncio.run(run_exploration(robot, home=None, budget=None, arm=False, report=lines.append))
-    assert lines[0] == "    0 s  it waits: the planner is starting"
+    assert lines[0] == "    0 s  waiting: the planner is starting"
     assert "waits" not in lines[1]
     assert "looking" in lines[1]
 
@@ -192,7 +192,7 @@ def test_the_tags_that_are_found_are_counted_at_once():
 def test_another_exploration_ends_it():
     robot = Robot(state(4, ExplorationPhase.LOOKING, source="bob"))
     end = asyncio.run(run_exploration(robot, home=None, budget=None, arm=False))
-    assert (end.reason, end.text) == (Reason.CANCELLED, "bob started another one")
+    assert (end.reason, end.text) == (Reason.CANCELLED, "bob started another task")
 
 
 def test_a_truck_that_stands_disarmed_is_not_said_to_drive():
@@ -218,11 +218,11 @@ def test_a_truck_that_stands_disarmed_is_not_said_to_drive():
         robot.gate.put(held.model_copy(update={"reasons": (Reason.DISARMED, Reason.DRIVE_STALE)}))
 
     asyncio.run(run_exploration(robot, home=None, budget=None, arm=False, report=report))
-    assert lines[0] == "    0 s  it stands: the robot is disarmed (disarmed by bob); `monstertruckd arm` lets it drive"
+    assert lines[0] == "    0 s  standing: the robot is disarmed (disarmed by bob); `monstertruckd arm` lets it drive"
     assert len(lines) == 1, "once"
 
 
 def test_before_the_first_look_at_the_map_it_tells_no_zeros():
     starts = progress_line(state(3, ExplorationPhase.LOOKING))
-    assert starts.endswith("waits for the first look at the map")
+    assert starts.endswith("waiting for the first analysis of the map")
     assert progress_line(state(3, ExplorationPhase.LOOKING, known=12.0)).endswith("looking")

@@ -47,7 +47,7 @@ def test_a_robot_without_a_planner_is_reported(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("monstertruck_runtime.client.TruckClient", Unplanned)
     done = CliRunner().invoke(app, ["goto", "1", "0", "0"])
     assert done.exit_code == Reason.NOT_FOUND.exit_code
-    text = "expected a section `planner` in its configuration, as the bundled `goals` has"
+    text = "add a section `planner` to its configuration, like the bundled `goals`"
     assert done.output.splitlines()[1:] == [f"robot 'truck' has no planner: {text}"]
 
 
@@ -246,7 +246,7 @@ def test_a_path_in_whose_place_another_one_is_followed_has_ended_and_that_is_not
         return following.result(), robot.asked
 
     arrival, asked = run_virtual(main)
-    assert (arrival.reason, arrival.text) == (Reason.CANCELLED, "another path is followed now")
+    assert (arrival.reason, arrival.text) == (Reason.CANCELLED, "the tracker follows another path")
     assert asked == ["path"]
 
 

@@ -111,7 +111,7 @@ def test_fit_of_the_paper():
     assert found["worst_percent_on_the_driven_ratios_alone"]["symmetric"] <= 5.5
     assert found["worst_percent_on_the_radii_alone"]["symmetric"] == pytest.approx(16.98, abs=0.02)
     assert found["unexplained_percent"] == pytest.approx(3.24, abs=0.01)
-    assert "3.2 % off" in run("fit", "--model", "icr", "--no-bounded")
+    assert "differ by up to 3.2 %" in run("fit", "--model", "icr", "--no-bounded")
 
 
 def test_fit_of_a_trajectory(tmp_path):

@@ -24,14 +24,16 @@ def test_long_lists_and_texts_are_cut_and_say_so():
     assert (short["name"], short["pose"]) == ("scan", {"x": 1.0, "of": [1, 2]})
 
 
-BROKEN = "robot 'truck' is there but publishes no sensor/scan yet; waiting; not ready: lidar (/dev/lidar: unplugged)"
+BROKEN = (
+    "robot 'truck' is running but does not publish sensor/scan yet; waiting; not ready: lidar (/dev/lidar: unplugged)"
+)
 
 
 @pytest.mark.parametrize(
     ("topic", "alive", "said"),
     [
         (topics.SCAN, True, BROKEN),
-        (topics.SCAN, False, "no robot 'truck' seen at tcp/x:1; waiting for sensor/scan"),
+        (topics.SCAN, False, "robot 'truck' not found at tcp/x:1; waiting for sensor/scan"),
         (
             topics.STAND_POSE,
             True,

@@ -55,7 +55,7 @@ def test_a_lidar_that_is_not_mounted_as_given_is_reported(log: Path, tmp_path: P
     assert abs(json.loads(right.stdout)["lidar_yaw_off"]) < np.radians(1)
     wrong = CliRunner().invoke(app, ["map", "build", *map(str, arguments), "--mount", "0", "0", "5"])
     assert np.degrees(json.loads(wrong.stdout)["lidar_yaw_off"]) == pytest.approx(-5, abs=1)
-    assert "the lidar is turned by -" in wrong.stderr
+    assert "the lidar is rotated by -" in wrong.stderr
 
 
 def arrays_of(log: Path) -> dict[str, np.ndarray]:
@@ -76,7 +76,7 @@ def test_the_summary_says_what_odometry_was_worth_and_why_scans_were_left_out(lo
     assert done.exit_code == 0, done.output
     facts = json.loads(done.stdout)
     assert facts["left_out"] == 2
-    assert facts["left_out_by"] == {"not later than the scan before": 1, "too few returns": 1}
+    assert facts["left_out_by"] == {"stamp not later than the previous scan's": 1, "too few returns": 1}
     assert facts["odometry"]["used"] + facts["odometry"]["missing"] == pytest.approx(1.0)
     assert 0.3 < facts["odometry"]["missing"] < 0.5
     assert facts["lost_share"] == 0.0
@@ -101,7 +101,7 @@ def test_lost_poses_are_marked_and_the_exit_code_says_so(log: Path, tmp_path: Pa
         ["map", "build", str(tmp_path / "log.npz"), "-o", str(tmp_path / "map"), "--trajectory", str(poses), "--json"],
     )
     assert done.exit_code == Reason.POSE_LOST.exit_code
-    assert "of the path of" in done.stderr.splitlines()[-1]
+    assert "path (limit" in done.stderr.splitlines()[-1]
     facts, lost = json.loads(done.stdout), np.loadtxt(tmp_path / "poses.lost.txt")
     assert facts["lost_share"] > 0.2
     assert facts["lost_poses"] == len(lost) > 60
@@ -160,7 +160,7 @@ def test_a_log_by_another_program_becomes_a_map(tmp_path: Path):
     save_map(WorldMap(np.zeros((10, 10), np.int8), 0.05), plain)
     refused = CliRunner().invoke(app, ["map", "show", str(plain), "--g2o", str(tmp_path / "graph.g2o")])
     assert refused.exit_code == 3
-    assert "a grid without a pose graph" in refused.stderr
+    assert "an occupancy grid without a pose graph" in refused.stderr
 
 
 def test_a_log_whose_scans_all_have_one_stamp_is_lost_by_its_odometry(log: Path, tmp_path: Path):
@@ -170,7 +170,7 @@ def test_a_log_whose_scans_all_have_one_stamp_is_lost_by_its_odometry(log: Path,
     assert done.exit_code == Reason.POSE_LOST.exit_code
     facts = json.loads(done.stdout)
     assert facts["lost_share"] == 1.0
-    assert facts["left_out_by"] == {"not later than the scan before": 59}
+    assert facts["left_out_by"] == {"stamp not later than the previous scan's": 59}
 
 
 @pytest.mark.parametrize(
@@ -200,7 +200,7 @@ def test_a_log_without_a_usable_scan_is_one_sentence(log: Path, tmp_path: Path, 
     place = ["-o", str(tmp_path / "map")] if command == "build" else [str(grid)]
     result = CliRunner().invoke(app, ["map", command, str(file), *place])
     assert result.exit_code != 0
-    assert f"none of its 3 scans can be used; the last one: only 0 of {BEAMS} beams" in result.output.replace("\n", " ")
+    assert f"none of its 3 scans is usable; the last one: only 0 of {BEAMS} beams" in result.output.replace("\n", " ")
     assert "Traceback" not in result.output
     assert not (tmp_path / "map").exists()
 
@@ -227,7 +227,7 @@ def test_a_configuration_for_localisation_replaces_only_what_it_wrote_itself(tmp
         before = target.read_text()
         done = load(own if target != output else output, target)
         assert done.exit_code == 3
-        said = f"{target}: is there already, and this command did not write it; name another file"
+        said = f"{target}: exists and was not written by this command; choose another file"
         assert done.stderr.splitlines()[-1] == said
         assert target.read_text() == before
 

@@ -61,7 +61,7 @@ def test_a_mistake_is_named_once_and_with_what_its_step_takes(tmp_path: Path):
     lines = [line.partition("bad.yaml:")[2] for line in done.output.splitlines() if "bad.yaml:" in line]
     assert [line[:2] for line in lines] == ["4:", "5:"], done.output
     assert lines[0].startswith("4: steps.0.settings.speed: input should be a finite number")
-    assert "steps.1.quickly: unknown key; known here: do, limit, on_failure, retries, seconds" in lines[1]
+    assert "steps.1.quickly: unknown key; expected one of do, limit, on_failure, retries, seconds" in lines[1]
 
 
 def test_list_names_missions_and_what_is_wrong(tmp_path: Path):
@@ -117,9 +117,9 @@ def test_every_step_and_every_failure_is_a_line():
     missed = {"failed": "it missed"}
     assert followed(first, first, {**first, **missed, "attempt": 2}, {**second, **missed, "elapsed": 12.0}) == [
         "     0 s  step 1 of 2: goto 1 0 0",
-        "     0 s  it failed: it missed",
+        "     0 s  failed: it missed",
         "     0 s  step 1 of 2: goto 1 0 0, attempt 2",
-        "    12 s  it failed: it missed",
+        "    12 s  failed: it missed",
         "    12 s  step 2 of 2: return",
     ]
 
@@ -127,8 +127,8 @@ def test_every_step_and_every_failure_is_a_line():
 def test_what_a_step_waits_for_and_why_the_robot_stands_is_said_once():
     step = {"node": "1", "doing": "goto 1 0 0"}
     starts = {**step, "text": "the planner is starting"}
-    assert followed(starts, starts, step)[1:] == ["     0 s  it waits: the planner is starting"]
-    stands = "     0 s  it stands: the robot is disarmed; `monstertruckd arm` lets it drive"
+    assert followed(starts, starts, step)[1:] == ["     0 s  waiting: the planner is starting"]
+    stands = "     0 s  standing: the robot is disarmed; `monstertruckd arm` lets it drive"
     assert followed(starts, step, step, mode=GateMode.DISARMED)[1:] == [stands], "though more becomes stale"
 
 
@@ -183,5 +183,5 @@ def test_what_the_robot_lacks_and_points_that_nobody_knows_are_named_by_line(tmp
     file.write_text("version: 2\nname: patrol\nsteps:\n  - do: goto_point\n    point: dock\n")
     done = CliRunner().invoke(app, ["mission", "check", str(file), "--map", str(saved)])
     assert (
-        done.stderr == f"{file}:5: step 1: no point of interest 'dock' is known and no step explores: known are none\n"
+        done.stderr == f"{file}:5: step 1: point of interest 'dock' is unknown and no step explores: known are none\n"
     )

@@ -81,7 +81,7 @@ def test_an_order_to_arm_that_is_interrupted_is_taken_back(capsys: pytest.Captur
 
     asyncio.run(main())
     assert robot.orders == [Order.ARM, Order.DISARM]
-    assert capsys.readouterr().err == "disarmed: there was no answer to the order to arm\n"
+    assert capsys.readouterr().err == "disarmed: the gate did not answer the order to arm\n"
 
 
 def test_an_order_to_arm_without_an_answer_is_taken_back():
@@ -161,7 +161,7 @@ def test_arming_says_who_drives_or_waits(monkeypatch: pytest.MonkeyPatch, capsys
 def test_who_sets_off_is_said_before_arming(capsys: pytest.CaptureFixture[str]):
     waiting = state(GateMode.DISARMED).model_copy(update={"waiting": ("tracker",)})
     asyncio.run(orders._announce(Robot(waiting, waiting), hold=False))  # type: ignore[arg-type]
-    assert capsys.readouterr().err == "will start at once: tracker; --hold arms without\n"
+    assert capsys.readouterr().err == "will start to drive at once: tracker; --hold arms without starting\n"
     for newest in (state(GateMode.DISARMED), None):
         asyncio.run(orders._announce(Robot(waiting, newest), hold=False))  # type: ignore[arg-type]
     assert capsys.readouterr().err == ""
@@ -174,9 +174,14 @@ def test_who_sets_off_is_said_before_arming(capsys: pytest.CaptureFixture[str]):
             GateMode.DISARMED,
             False,
             "lap",
-            "will start at once: tracker, along path 'lap' of 14.0 m; --hold arms without\n",
+            "will start to drive at once: tracker, along path 'lap' of 14.0 m; --hold arms without starting\n",
         ),
-        (GateMode.DISARMED, False, "", "will start at once: tracker, along its path of 14.0 m; --hold arms without\n"),
+        (
+            GateMode.DISARMED,
+            False,
+            "",
+            "will start to drive at once: tracker, along its path of 14.0 m; --hold arms without starting\n",
+        ),
         (GateMode.DISARMED, True, "lap", ""),
         (GateMode.ARMED, False, "lap", ""),
     ],

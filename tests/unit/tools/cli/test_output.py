@@ -83,7 +83,7 @@ def test_a_missing_package_is_one_sentence(capsys: pytest.CaptureFixture[str]):
         import no_such_package  # noqa: F401
 
     assert ending(command) == Reason.NOT_INSTALLED.exit_code
-    assert "no_such_package is not installed: an extra brings it" in capsys.readouterr().err
+    assert "no_such_package is not installed: install the extra that contains it" in capsys.readouterr().err
 
 
 def test_an_interrupt_gives_up_but_is_the_ordinary_end_of_what_runs_until_stopped():
@@ -181,7 +181,7 @@ def test_help_has_the_width_of_the_terminal_it_stands_on(columns: int):
         called("log", "--help", env=bare, stdin=terminal, stdout=terminal, stderr=subprocess.PIPE)
         lines = os.read(reader, 1 << 16).decode().splitlines()
         assert max(map(len, lines)) <= columns
-        assert any(line.endswith("the original stays as LOG.damaged.") for line in lines) is (columns > 100)
+        assert any(line.endswith("the original is renamed to LOG.damaged.") for line in lines) is (columns > 100)
         assert lines[0].isascii()
     finally:
         os.close(reader)
@@ -368,13 +368,13 @@ def test_the_end_of_a_drive_says_angles_in_degrees_too(capsys: pytest.CaptureFix
 def test_lines_of_progress_break_no_word_on_a_terminal(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    line = "  155 s  it stands: no fresh drive feedback"
+    line = "  155 s  standing: no fresh drive feedback"
     print_words(line)
     assert capsys.readouterr().out == f"{line}\n"
     monkeypatch.setattr("monstertruckd.tools.cli.output.on_terminal", lambda _: True)
     monkeypatch.setenv("COLUMNS", "36")
     print_words(line)
-    assert capsys.readouterr().out == "  155 s  it stands: no fresh drive\nfeedback\n"
+    assert capsys.readouterr().out == "  155 s  standing: no fresh drive\nfeedback\n"
 
 
 def test_answers_of_emulated_robots_break_no_word_on_a_terminal(
@@ -389,7 +389,8 @@ def test_answers_of_emulated_robots_break_no_word_on_a_terminal(
     monkeypatch.setattr("monstertruckd.tools.cli.output.on_terminal", lambda _: True)
     monkeypatch.setenv("COLUMNS", "40")
     assert CliRunner().invoke(app, ["simulate"]).output.splitlines() == [
-        "error: name a device first: lidar,",
-        "drive, steering, compass, stabiliser;",
-        "`lidar help` lists its commands",
+        "error: start the line with a device:",
+        "lidar, drive, steering, compass,",
+        "stabiliser; `lidar help` lists its",
+        "commands",
     ]

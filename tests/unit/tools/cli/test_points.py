@@ -78,4 +78,4 @@ def test_a_cameras_lens_is_converted_to_and_from_the_forms_of_others(tmp_path):
     bare = tmp_path / "bare.yaml"
     bare.write_text("version: 2\nrobot: truck\ndevices: {}\n")
     refused = CliRunner().invoke(app, ["convert-lens", str(bare)])
-    assert "has no camera whose lens it states" in refused.stderr
+    assert "has no camera with lens parameters" in refused.stderr

@@ -41,7 +41,7 @@ def test_a_port_that_no_rule_makes_is_pointed_out(tmp_path: Path):
     file = tmp_path / "mine.yaml"
     file.write_text("version: 1\ndevices:\n  lidar: {port: {path: /dev/truck/lidar}, driver: {kind: hokuyo_urg}}\n")
     said = run("install-service", "--config", file, "--root", tmp_path)
-    assert "note: devices.lidar.port: /dev/truck/lidar is made by no rule" in said.stderr
+    assert "note: devices.lidar.port: /dev/truck/lidar is not created by any udev rule" in said.stderr
 
 
 def test_who_may_not_install_gets_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

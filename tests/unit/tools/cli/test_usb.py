@@ -62,7 +62,7 @@ def test_the_drawn_tree_nests_by_port():
     [drive] = hub.children
     for part in ("port 3", "drive", "FT232R 0403:6001 ttyUSB0", "present", "2 replugs", "may be suspended"):
         assert part in str(drive.label)
-    assert "1-7 never seen" in str(unseen.label)
+    assert "1-7 never connected" in str(unseen.label)
     assert "port 2  compass" in str(unseen.children[0].label)
     assert "absent" in str(unseen.children[0].label)
 
@@ -161,7 +161,7 @@ def test_a_hub_several_cables_or_a_stick_are_not_taken(tmp_path: Path):
         await bench.clock.sleep(1)
         bench.usb.lose_hub("1-1")
         await bench.clock.sleep(1)
-        assert "a whole hub vanished" in said[-1]
+        assert "a whole hub disappeared" in said[-1]
         await bench.usb.return_hub("1-1", bench.clock)
         await bench.clock.sleep(1)
         bench.usb.unplug("1-1.1")
@@ -171,7 +171,7 @@ def test_a_hub_several_cables_or_a_stick_are_not_taken(tmp_path: Path):
         bench.usb.plug("1-1.1")
         bench.usb.unplug("1-2.3")
         await bench.clock.sleep(1)
-        assert "no serial port or camera" in said[-1]
+        assert "not a serial port or camera" in said[-1]
         bench.usb.unplug("1-1.1")
         bench.usb.plug("1-1.1")
         port = await finding

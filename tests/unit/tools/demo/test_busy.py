@@ -14,7 +14,7 @@ from monstertruckd.tools.simulation.operator import Lap
 def test_a_load_beyond_the_processors_is_named(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     monkeypatch.setattr(os, "getloadavg", lambda: (5.5, 1.0, 1.0))
-    assert busy() == "this computer is busy, 5.5 programs for 2 processors"
+    assert busy() == "this computer is busy: load 5.5 on 2 processors"
     monkeypatch.setattr(os, "getloadavg", lambda: (1.9, 9.0, 9.0))
     assert busy() == ""
 
@@ -27,4 +27,4 @@ def test_stops_of_a_busy_computer_come_with_the_way_out(late: float, stops: bool
     rows = dict(summary.rows())
     assert ("busy computer" in rows) is named
     if named:
-        assert rows["busy computer"] == "ticks came 50 ms late: end other programs, or use --fast"
+        assert rows["busy computer"] == "ticks were 50 ms late: end other programs, or use --fast"

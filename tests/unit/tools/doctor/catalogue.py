@@ -305,7 +305,7 @@ FAULTS: tuple[Fault, ...] = (
             lambda made, role=role: made.computer.usb.over_current(PLACES[role]),
             "over-current",
             Reason.OVER_CURRENT,
-            "hub with a supply",
+            "self-powered hub",
             _on(role),
         )
         for role in ("camera", "steering")
@@ -548,7 +548,7 @@ FAULTS: tuple[Fault, ...] = (
         Fault(f"log: {check}", log(event(reason)), check, reason, mend, _on("log"))
         for check, reason, mend in (
             ("brown-out", Reason.DEVICE_RESTARTED, "measure it"),
-            ("clock steps", Reason.CLOCK_STEPPED, "set it before"),
+            ("clock steps", Reason.CLOCK_STEPPED, "set the clock before"),
             ("throttled", Reason.HOST_THROTTLED, "measure its supply"),
             ("over-current", Reason.OVER_CURRENT, "use a supplied hub"),
         )

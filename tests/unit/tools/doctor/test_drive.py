@@ -41,10 +41,15 @@ def found(rows):
 @pytest.mark.parametrize(
     ("how", "check", "said", "fix"),
     [
-        ({"compass": -1}, "sign compass", "against the steering and the IMU, lidar: it is mounted upside down", None),
+        (
+            {"compass": -1},
+            "sign compass",
+            "opposite to the steering and the IMU, lidar: it is mounted upside down",
+            None,
+        ),
         ({"imu": -1}, "sign IMU", "upside down", None),
         ({"lidar": -1}, "sign lidar", "upside down", None),
-        ({"motion": -1}, "sign lidar", "the lidar looks back", None),
+        ({"motion": -1}, "sign lidar", "the lidar faces backwards", None),
         ({"compass": -1, "imu": -1, "lidar": -1}, "sign steering", "wrong", "calibrate steering --rough"),
         ({"compass": -1, "imu": -1, "lidar": -1, "motion": -1}, "sign motor", "wrong", "calibrate drive --sign-only"),
         ({"imu": 0.0}, "sign IMU", "0% of the turn", None),

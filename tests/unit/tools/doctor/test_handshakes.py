@@ -101,7 +101,7 @@ def test_nothing_is_asked_while_a_daemon_runs(words: tuple[str, ...], tmp_path: 
     monkeypatch.setattr(module, "_handshake", never)
     (found,) = see(tmp_path, handshakes, lambda emulated: emulated.process(4711, *words)).values()
     assert found.level is Level.OK
-    assert found.seen == "not tried: the running daemon (process 4711) has the ports"
+    assert found.seen == "not tested: the running daemon (process 4711) uses the ports"
     assert found.fix == "/opt/monstertruckd/.venv/bin/python -m monstertruckd status --once"
 
 

@@ -27,9 +27,7 @@ def test_no_calibration_is_a_warning(tmp_path: Path):
     assert "calibrate all" in found["calibration"].fix
 
 
-@pytest.mark.parametrize(
-    ("half", "days", "said"), [(3.0, 10, None), (3.0, 400, "counted until"), (20.0, 10, "grade C")]
-)
+@pytest.mark.parametrize(("half", "days", "said"), [(3.0, 10, None), (3.0, 400, "valid until"), (20.0, 10, "grade C")])
 def test_age_and_grade(half, days, said, tmp_path: Path):
     found = see(tmp_path, history.calibration, lambda made: calibrated(made, half, days))
     wrong = bad(found)

@@ -176,7 +176,7 @@ def test_files_that_this_user_may_not_read_are_named(tmp_path: Path, monkeypatch
         )
 
     found = see(tmp_path / "closed", access, behind_a_closed_folder)["tls"]
-    assert (found.level, found.seen) == (Level.WARN, "/pki/robot.key: not checked, this user may not read it")
+    assert (found.level, found.seen) == (Level.WARN, "/pki/robot.key: not checked, because this user may not read it")
 
 
 def test_a_port_that_somebody_else_has(tmp_path: Path):

@@ -51,7 +51,7 @@ def test_packages_of_a_robot_must_be_there_others_may(tmp_path: Path):
     assert found["extras"].seen == "installed: none; incomplete: view (rerun-sdk)"
     ours = [*REQUIRES, "pytest>=8; extra == 'dev'", "mkdocs-material>=9; extra == 'docs'"]
     found = see(tmp_path / "d", lambda context: packages(context, ours), without("pytest"))
-    assert found["extras"].seen == "installed: view; for work on the project, not all there: dev"
+    assert found["extras"].seen == "installed: view; incomplete, needed for development only: dev"
     lacking = see(tmp_path / "b", check, without("mcap", "numpy"))["packages"]
     assert lacking.reason is Reason.NOT_INSTALLED
     assert lacking.seen == "missing: numpy, mcap"
@@ -146,7 +146,7 @@ def test_modem_manager_is_harmless_with_the_rules(tmp_path: Path):
         (emulated.folder / RULES.relative_to("/")).unlink()
 
     assert see(tmp_path / "a", rules)["ModemManager"].seen == "does not run"
-    assert see(tmp_path / "b", rules, running)["ModemManager"].seen == "runs, and ignores the robot's ports"
+    assert see(tmp_path / "b", rules, running)["ModemManager"].seen == "runs, but ignores the robot's ports"
     assert see(tmp_path / "c", rules, without_rules)["ModemManager"].level is Level.WARN
 
 
@@ -191,7 +191,7 @@ def test_measures_of_the_motion_and_what_is_missing(tmp_path: Path):
     assert bad(see(tmp_path / "b", motion, without("kiss-icp"))).keys() == {"scan odometry"}
     for name in ("numba", "scipy"):
         missing = see(tmp_path / name, motion, without(name))["scan odometry"]
-        assert missing.seen == f"{name} not installed: the motion by scans is not measured"
+        assert missing.seen == f"{name} not installed: the motion is not measured by scans"
     alone = see(tmp_path / "c", motion, lambda emulated: emulated.change(consistency=None))["motion"]
     assert (alone.level, alone.reason) == (Level.WARN, Reason.UNWITNESSED)
 

@@ -50,7 +50,7 @@ def lose(emulated: EmulatedHost) -> None:
             FIND_LIDAR,
         ),
         (swap, Reason.DEVICE_WRONG, "hub 1-2 port 1: expected 15d1:0000, found 1d50:6018 Black Magic", FIND_LIDAR),
-        (lose, Reason.HUB_LOST, "hub 1-2 port 1: hub 1-2 is not there", None),
+        (lose, Reason.HUB_LOST, "hub 1-2 port 1: hub 1-2 is missing", None),
     ],
 )
 def test_a_device_that_is_not_where_it_should_be(change, reason: Reason, seen: str, fix: str | None, tmp_path: Path):
@@ -103,7 +103,7 @@ def test_slow_sleepy_and_greedy_ports(tmp_path: Path):
         "over-current": Reason.OVER_CURRENT,
     }
     assert all(finding.level is Level.WARN for finding in found.values())
-    assert found["drive latency"].seen == "ttyUSB0 answers after 16 ms instead of 1 ms"
+    assert found["drive latency"].seen == "ttyUSB0 has a latency of 16 ms instead of 1 ms"
     assert found["drive latency"].fix == "echo 1 | sudo tee /sys/bus/usb/devices/1-1.1:1.0/ttyUSB0/latency_timer"
     assert found["steering power"].fix == "echo on | sudo tee /sys/bus/usb/devices/1-1.2/power/control"
 
@@ -122,7 +122,7 @@ def test_a_device_by_its_path(tmp_path: Path):
         emulated.put("dev/truck/lidar")
 
     missing = see(tmp_path / "a", wiring, by_path)["lidar"]
-    assert (missing.seen, missing.fix) == ("/dev/truck/lidar: no such node", FIND_LIDAR)
+    assert (missing.seen, missing.fix) == ("/dev/truck/lidar: does not exist", FIND_LIDAR)
     assert see(tmp_path / "b", wiring, linked)["lidar"].level is Level.OK
 
 
@@ -136,7 +136,7 @@ def on_a_bus(emulated: EmulatedHost) -> None:
 
 def test_a_device_on_an_i2c_bus(tmp_path: Path):
     found = see(tmp_path / "a", wiring, on_a_bus)["steering"]
-    assert found.seen == "/dev/i2c-1: no such node; enable the bus in the computer's settings"
+    assert found.seen == "/dev/i2c-1: does not exist; enable the bus in the computer's settings"
     assert found.fix == "sudo modprobe i2c-dev"
 
     def closed(emulated: EmulatedHost) -> None:

@@ -195,7 +195,7 @@ def test_a_simulated_truck_is_no_service(tmp_path: Path):
 
 
 def test_without_any_configuration_it_asks_for_one(tmp_path: Path):
-    with pytest.raises(NotFoundError, match="name the robot's with --config FILE"):
+    with pytest.raises(NotFoundError, match="pass the robot's with --config FILE"):
         truck_plan(tmp_path, None)
 
 

@@ -105,7 +105,7 @@ def test_without_ready_the_version_before_runs_again(interrupted: bool, computer
     config.write_text(f"include: {TRUCK}\n")
     before = {path: path.read_text() for path in computer.file("/etc").rglob("*") if path.is_file()}
     computer.fails, computer.interrupted = ["/opt/next"], interrupted
-    with pytest.raises(CommandFailedError, match="the version before runs again"):
+    with pytest.raises(CommandFailedError, match="the previous version runs again"):
         computer.upgrade(config=config)
     assert computer.ran == [*AFTER_INSTALL, RESTART, *AFTER_INSTALL, RESTART]
     assert {path: path.read_text() for path in before} == before
@@ -120,7 +120,7 @@ def test_it_says_so_when_neither_version_runs(computer: Computer):
 
 def test_a_version_in_the_same_folder_has_none_to_go_back_to(computer: Computer):
     computer.fails = ["/opt"]
-    with pytest.raises(CommandFailedError, match="the one before was in the same folder"):
+    with pytest.raises(CommandFailedError, match="the previous one was in the same folder"):
         computer.upgrade(PROGRAM, TRUCK)
     assert computer.ran == [RESTART]
 
@@ -136,7 +136,7 @@ def test_a_dry_run_is_refused_alike_and_changes_nothing(computer: Computer):
 
 
 def test_there_must_be_a_service_of_a_system_that_runs(computer: Computer, tmp_path: Path):
-    with pytest.raises(InputError, match="no systemd runs there"):
+    with pytest.raises(InputError, match="systemd does not run there"):
         upgrade(truck_plan(tmp_path / "image", TRUCK, NEXT), tmp_path / "image", run=computer)
     computer.file(str(UNIT)).unlink()
     with pytest.raises(NotFoundError, match="no service is installed"):

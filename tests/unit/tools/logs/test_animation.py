@@ -53,7 +53,7 @@ def test_what_cannot_be_drawn_is_refused(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(animation, "MOST_FRAMES", 5)
     with pytest.raises(InputError, match=r"x\.png: expected a name that ends with \.gif"):
         animate(open_log(GOLDEN), tmp_path / "x.png", speed=8.0, width=320)
-    with pytest.raises(InputError, match=r"pictures, at most 5: expected --speed 10 or more"):
+    with pytest.raises(InputError, match=r"frames, at most 5: expected --speed 10 or more"):
         animate(open_log(GOLDEN), tmp_path / "x.gif", speed=1.0, width=320)
     monkeypatch.undo()
     with pytest.raises(CommandFailedError, match=r"x\.gif: No such file"):

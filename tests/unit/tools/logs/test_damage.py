@@ -84,7 +84,7 @@ def test_what_turned_into_an_end_is_none(tmp_path):
     file.write_bytes(data)
     reader = open_log(file)
     assert list(reader) == []
-    assert "1 lost (0.0 to 0.0 s after its begin)" in reader.damage
+    assert "1 lost (0.0 to 0.0 s after its start)" in reader.damage
 
 
 @pytest.mark.parametrize("opcode", [0x86, Opcode.MESSAGE_INDEX, Opcode.SUMMARY_OFFSET, 0x46])
@@ -96,7 +96,7 @@ def test_a_lost_chunk_is_counted(log, master, opcode):
     reader = open_log(log)
     kept, whole = len(list(reader)), len(master[1])
     assert 0 < kept < whole
-    assert f"holds {kept} of {whole} messages: {whole - kept} lost (" in reader.damage
+    assert f"contains {kept} of {whole} messages: {whole - kept} lost (" in reader.damage
     assert recover(log, log).messages == kept
 
 
@@ -132,7 +132,7 @@ def test_a_damaged_attachment_is_reported_kept_and_not_used(log, master):
     log.write_bytes(log.read_bytes().replace(b'"a": 1', b'"a": 2', 1))
     reader = open_log(log)
     assert len(list(reader)) == len(master[1])
-    assert (reader.damage, reader.fault) == (None, "holds a damaged config.json")
+    assert (reader.damage, reader.fault) == (None, "contains a damaged config.json")
     for _ in range(2):
         with pytest.raises(InputError, match=rf"{log.name}: config\.json in it is damaged"):
             open_log(log).config()

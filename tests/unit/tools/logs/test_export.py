@@ -241,7 +241,7 @@ def test_bag_holds_the_values_of_the_log(log, tmp_path):
 
 def test_bag_never_overwrites(log, tmp_path):
     (tmp_path / "bag").mkdir()
-    with pytest.raises(InputError, match="no bag can be made there"):
+    with pytest.raises(InputError, match="the bag cannot be created"):
         export_ros2(log, tmp_path / "bag")
 
 
@@ -275,7 +275,7 @@ def test_dated_log_is_a_log_like_any_other(log, tmp_path):
     assert real_offset(open_log(dated)) == 0
     (row,) = next(m.decode() for m in after if m.topic == "health/services").services
     assert row.since == SECOND - 3 + MAY_2026
-    with pytest.raises(InputError, match=r"dated\.mcap: is there already"):
+    with pytest.raises(InputError, match=r"dated\.mcap: already exists"):
         export_mcap(log, dated)
 
 

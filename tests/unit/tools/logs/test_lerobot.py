@@ -71,7 +71,7 @@ def test_a_frame_holds_what_was_newest_at_its_time(tmp_path):
 
 def test_what_makes_no_data_set_is_refused(tmp_path):
     log = write(tmp_path / "run.mcap")
-    with pytest.raises(InputError, match="leave the option --topic out"):
+    with pytest.raises(InputError, match="omit the option --topic"):
         export_lerobot(log, tmp_path / "set", Selection(("sensor/scan",)))
     still = write(tmp_path / "still.mcap", commands=False)
     with pytest.raises(InputError, match=r"still\.mcap: no message of cmd/drive"):
@@ -82,5 +82,5 @@ def test_what_makes_no_data_set_is_refused(tmp_path):
     assert not (tmp_path / "set").exists()
     assert export_lerobot(log, tmp_path / "set", Selection(start=100.0)) == {}
     (tmp_path / "set").mkdir()
-    with pytest.raises(InputError, match="is there already"):
+    with pytest.raises(InputError, match="already exists"):
         export_lerobot(log, tmp_path / "set")

@@ -57,7 +57,7 @@ def test_recordings_of_a_robot_are_listed_and_fetched_and_a_file_of_something_el
     assert "2027-01-15 08:00:00  0.00  run, being written  run-000001-000.mcap" in run("fetch").output
     assert "not listed" not in run("fetch").output
     monkeypatch.setattr(RobotWithRecordings, "LEFT_OUT", 12)
-    assert "12 older ones are not listed" in run("fetch").stderr
+    assert "12 older logs are not listed" in run("fetch").stderr
     file = tmp_path / "run-000001-000.mcap"
     file.write_bytes(RobotWithRecordings.DATA[:100])
     assert json.loads(run("fetch", file.name, "--json").stdout)["bytes"] == 768
@@ -100,7 +100,7 @@ def test_a_data_set_is_one_folder_of_the_topics_that_it_needs(tmp_path):
     assert frames > 30
     refused = run("export", GOLDEN, target, "--format", "lerobot", "--topic", "sensor/scan")
     assert refused.exit_code == 3
-    assert "leave the option --topic out" in refused.output
+    assert "omit the option --topic" in refused.output
 
 
 @pytest.mark.parametrize(
@@ -231,7 +231,7 @@ def test_info_knows_a_log_that_is_being_written(tmp_path):
     log.write_bytes(GOLDEN.read_bytes()[:-20])
     with log.open("rb") as writer:
         fcntl.flock(writer, fcntl.LOCK_EX)
-        assert "it is being written" in run("info", log).output
+        assert "the recorder is writing it" in run("info", log).output
     assert "`monstertruckd log recover` repairs it" in run("info", log).output
 
 
@@ -288,7 +288,7 @@ def test_a_log_of_another_program_is_called_so(tmp_path):
         for i in range(3):
             writer.add_message(channel, 10**9 + i, b"{}", 10**9 + i)
         writer.finish()
-    said = "other.mcap: no message of a topic of this version"
+    said = "other.mcap: no message of a topic known to this version"
     assert said in run("export", log, tmp_path / "out").output
     done = CliRunner().invoke(app, ["replay", str(log), "--endpoint", free_endpoint()])
     assert (done.exit_code, said in done.output) == (Reason.BAD_INPUT.exit_code, True)

@@ -38,8 +38,8 @@ def test_unfinished_log_is_read_up_to_its_end(cut, master):
     assert 0 < len(found) < len(master[1])
     assert found == master[1][: len(found)]
     place = f" of {cut.stat().st_size} (EndOfFile), cannot be read in 1 place, has no end"
-    assert f"{place}: perhaps some lost (from " in reader.damage
-    assert reader.damage.endswith(" s on after its begin)")
+    assert f"{place}: an unknown number lost (from " in reader.damage
+    assert reader.damage.endswith(" s on after its start)")
 
 
 def test_a_flipped_byte_costs_its_chunk_alone(log, master):
@@ -293,5 +293,5 @@ def test_invalid_message_in_a_log_is_named(tmp_path):
 
 def test_export_folder_that_cannot_be_made_is_named(log, tmp_path):
     (tmp_path / "out").write_text("in the way")
-    with pytest.raises(InputError, match="out: cannot be made"):
+    with pytest.raises(InputError, match="out: cannot be created"):
         export_csv(log, tmp_path / "out")

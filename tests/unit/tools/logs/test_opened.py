@@ -184,7 +184,7 @@ def test_a_damaged_picture_is_refused(tmp_path):
 def test_damage_is_a_warning_and_what_is_whole_is_read(file, tmp_path):
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(file.read_bytes()[: int(file.stat().st_size * 0.8)])
-    with pytest.warns(UserWarning, match=r"cut\.mcap: .*what is whole was read"):
+    with pytest.warns(UserWarning, match=r"cut\.mcap: .*only the intact part was read"):
         assert len(monstertruckd.open_log(cut).pandas("scan")) > 0
     with warnings.catch_warnings(action="error"):
         monstertruckd.open_log(file).pandas("scan")

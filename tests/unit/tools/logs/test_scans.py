@@ -80,7 +80,7 @@ def test_scans_of_one_second_are_spread_over_it(tmp_path: Path):
     file.write_text("".join(FLASER.format(x=k, time=5 + k // 4, logged=5 + k // 4) for k in range(10)))
     assert seconds(read_scans(file)) == pytest.approx([0.25 * k for k in range(10)])
     file.write_text("".join(FLASER.format(x=k, time=5, logged=5) for k in range(10)))
-    with pytest.raises(InputError, match=r"a\.log: expected times that rise: all 10 scans have one time"):
+    with pytest.raises(InputError, match=r"a\.log: expected increasing times: all 10 scans have the same time"):
         read_scans(file)
 
 
@@ -164,7 +164,7 @@ def test_the_geometry_is_the_callers_or_the_logs_and_what_is_assumed_is_said(tmp
     assert (scan.start_angle, scan.angle_increment, scan.range_max) == (-1.5, 0.02, 4.0)
     assert scan.mount == (0.1, 0.0, 0.5)
     assert log.assumed == ("range_min", "time_increment")
-    with pytest.raises(InputError, match=r"range_max: a log of this format \(urg\) brings its geometry"):
+    with pytest.raises(InputError, match=r"range_max: a log of this format \(urg\) contains its geometry"):
         read_scans(URG, LogGeometry(range_max=4.0))
     np.savez(file, **GOOD)
     assert set(read_scans(file).assumed) >= {"start_angle", "angle_increment", "range_max", "mount"}

@@ -191,7 +191,7 @@ def test_command_saves_a_recording(log, tmp_path):
 def test_without_a_display_nothing_is_started(tmp_path, monkeypatch):
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
         monkeypatch.delenv(name, raising=False)
-    with pytest.raises(CommandFailedError, match="needs a display, and there is none; --save"):
+    with pytest.raises(CommandFailedError, match="needs a display, but none is available; --save"):
         show(tmp_path / "x.rrd")
 
 

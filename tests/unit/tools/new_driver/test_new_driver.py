@@ -80,10 +80,10 @@ def test_the_catalog_takes_its_kind_and_emulates_it_on_the_truck(
 
 def test_nothing_is_overwritten_and_odd_names_are_refused(tmp_path: Path):
     write_driver(DriverKind.LIDAR, "acme", tmp_path)
-    with pytest.raises(InputError, match="exists; expected a new name"):
+    with pytest.raises(InputError, match="exists; choose another name"):
         write_driver(DriverKind.MOTORS, "acme", tmp_path)
     for name in ("Acme", "../acme", "5x", "a__b", ""):
-        with pytest.raises(InputError, match="expected a name of small letters"):
+        with pytest.raises(InputError, match="expected a name of lower-case letters"):
             write_driver(DriverKind.LIDAR, name, tmp_path)
     for name in ("ld19", "lidar"):
         with pytest.raises(InputError, match=f"has this name; expected another, such as acme_{name}"):

@@ -136,7 +136,7 @@ def test_impossible_robots_are_refused_and_nothing_is_written(tmp_path: Path, mo
 def test_nothing_is_overwritten(tmp_path: Path):
     folder = made(tmp_path, lidar="ld19")
     before = (folder / "robot.yaml").read_text()
-    with pytest.raises(InputError, match="exists; expected a new name"):
+    with pytest.raises(InputError, match="exists; choose another name"):
         made(tmp_path, speed=0.4)
     assert (folder / "robot.yaml").read_text() == before
 

@@ -41,5 +41,5 @@ def test_a_log_stands_for_itself():
 
 def test_a_box_whose_run_is_gone_says_so(box: Path, tmp_path: Path):
     (tmp_path / "logs/run-000001-000.mcap").unlink()
-    with pytest.raises(InputError, match=r"begins in the middle of its run, and the run's log /elsewhere/logs/run-"):
+    with pytest.raises(InputError, match=r"starts in the middle of its run, and the run's log /elsewhere/logs/run-"):
         check_log(box)

@@ -71,7 +71,7 @@ def test_calls_show_in_the_reports_they_caused():
         (4.0, 1, GoalPhase.PLANNING),
         (5.0, 1, GoalPhase.IDLE, cancelled),
         (6.0, 2, GoalPhase.PLANNING),
-        (7.0, 2, GoalPhase.IDLE, {"outcome": Reason.CANCELLED, "text": "another path is followed now"}),
+        (7.0, 2, GoalPhase.IDLE, {"outcome": Reason.CANCELLED, "text": "the tracker follows another path"}),
     )
     assert log.calls(PERIOD) == {
         1: RecordedCall("me", "base", GOAL),

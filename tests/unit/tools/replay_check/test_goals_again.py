@@ -224,7 +224,7 @@ def test_a_configuration_without_a_planner_leaves_it_out(tmp_path):
     assert check.left_out == "only one of the two configurations has a planner"
     assert not {topics.GOAL, topics.PATH, topics.TRACKER, topics.PLAN_DRIVE} & rows_of(check).keys()
     done = CliRunner().invoke(app, ["replay", str(GOALS), "--check", "--config", str(file)])
-    assert "goals and tracker are left out: only one of" in done.output.replace("\n", " ")
+    assert "goals and tracker are not recomputed: only one of" in done.output.replace("\n", " ")
 
 
 def own_config(**changes):
@@ -236,14 +236,14 @@ def own_config(**changes):
 def test_a_map_that_is_gone_leaves_the_planner_out(tmp_path):
     config = own_config(slam=None, planner={"map": str(tmp_path / "hall.yaml")})
     check = computed_again(changed(GOALS, tmp_path / "log.mcap", **config))
-    assert "hall.yaml: no such file, and the log does not hold it" in check.left_out
+    assert "hall.yaml: no such file, and the log does not contain it" in check.left_out
     assert check.figures()["left_out"] == check.left_out
 
 
 @pytest.mark.long
 def test_a_log_without_reports_leaves_the_planner_out(tmp_path):
     check = computed_again(changed(GOALS, tmp_path / "log.mcap", lambda one: None if one.topic == "plan/goal" else one))
-    assert check.left_out == "the log holds no report on goals"
+    assert check.left_out == "the log contains no state of goals"
     assert check.agrees
 
 
@@ -254,4 +254,4 @@ def test_waypoints_of_a_remote_call_leave_the_planner_out(tmp_path):
         return replace(one, payload=wire.encode(topics.GOAL, one.decode().model_copy(update={"waypoints": 1})))
 
     check = computed_again(changed(GOALS, tmp_path / "log.mcap", counted))
-    assert check.left_out == "waypoints came by remote call, which no log holds"
+    assert check.left_out == "waypoints came by remote call, which logs do not contain"

@@ -26,7 +26,7 @@ def test_no_log(tmp_path):
 
 
 def test_a_log_without_messages(tmp_path):
-    with pytest.raises(InputError, match="holds no messages"):
+    with pytest.raises(InputError, match="contains no messages"):
         check_log(write(tmp_path / "log.mcap", [], attachments_of(LEVEL)))
 
 
@@ -50,7 +50,7 @@ def test_a_log_whose_configuration_is_refused(tmp_path, attached, match):
 
 def test_a_log_without_sensors(tmp_path):
     entries = [entry for entry in some(LEVEL) if not entry.topic.startswith("sensor/")]
-    with pytest.raises(InputError, match="no messages of sensors"):
+    with pytest.raises(InputError, match="no sensor messages"):
         check_log(write(tmp_path / "log.mcap", entries, attachments_of(LEVEL)))
 
 
@@ -62,7 +62,7 @@ def test_a_log_without_outputs(tmp_path):
 
 def test_a_later_part_of_a_run(tmp_path):
     entries = list(open_log(LEVEL))[1500:]
-    with pytest.raises(InputError, match=r"begins with number [0-9]+: expected the first part of a run"):
+    with pytest.raises(InputError, match=r"starts with number [0-9]+: expected the first part of a run"):
         check_log(write(tmp_path / "log.mcap", entries, attachments_of(LEVEL)))
 
 
@@ -95,7 +95,7 @@ def test_an_unknown_configuration(tmp_path, name):
 def test_the_table_says_what_came_again():
     done = run(LEVEL, "--check", "--tolerance", "1e-6")
     assert done.exit_code == 0, done.output
-    assert "outputs equal bit for bit" in done.output
+    assert "outputs identical" in done.output
     assert "state/odometry" in done.output
 
 

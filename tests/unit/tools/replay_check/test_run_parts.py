@@ -57,13 +57,13 @@ def test_a_part_that_is_not_there_ends_the_run(parts):
     parts[1].unlink()
     check = computed_again(parts[2])
     assert check.reason is Reason.LOG_DAMAGED
-    assert check.damage == f"{parts[1].name} is not there: the run is known up to it alone"
+    assert check.damage == f"{parts[1].name} is missing: the run is known only up to it"
     assert check.agrees  # as far as it goes
     assert 1.5 < check.duration < 2.5
     done = CliRunner().invoke(app, ["replay", str(parts[0]), "--check"])
     assert done.exit_code == Reason.LOG_DAMAGED.exit_code
     assert f"(a run of {len(parts) - 1} parts)" in done.output.replace("\n", " ")
-    assert f"{parts[1].name} is not there" in done.output.replace("\n", " ")
+    assert f"{parts[1].name} is missing" in done.output.replace("\n", " ")
 
 
 def test_a_damaged_index_ends_no_run(parts):
@@ -85,7 +85,7 @@ def test_a_damaged_attachment_of_a_later_part_ends_no_run(parts):
 
 def test_without_its_first_part_a_run_cannot_be_computed(parts):
     parts[0].unlink()
-    with pytest.raises(InputError, match=rf"{parts[0].name} is not there: expected the first part"):
+    with pytest.raises(InputError, match=rf"{parts[0].name} is missing: expected the first part"):
         computed_again(parts[1])
 
 

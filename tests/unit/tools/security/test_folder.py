@@ -73,7 +73,7 @@ def test_a_robot_that_nobody_could_reach_is_refused_before_anything_is_made(
 def test_nothing_is_certified_for_longer_than_its_authority_or_by_a_wrong_clock(folder: Folder):
     with pytest.raises(InputError, match="expires in 100"):
         add(folder, "ann", now=NOW + (AUTHORITY_DAYS - 100) * DAY)
-    with pytest.raises(InputError, match=r"the authority begins in 10\.0 days: this computer's clock is wrong"):
+    with pytest.raises(InputError, match=r"the authority becomes valid in 10\.0 days: this computer's clock is wrong"):
         add(folder, "ann", now=NOW - 300 - 10 * DAY)
     late = NOW + 3000 * DAY
     add(folder, "ann", now=late)
@@ -209,5 +209,5 @@ def test_who_revokes_the_last_pilot_hears_what_follows(folder: Folder):
     make_router(folder.path / "router", [folder], ["10.0.0.1"], NOW)
     revoked = CliRunner().invoke(app, ["security", "revoke", "ann", "--folder", str(folder.path)])
     assert revoked.exit_code == 0
-    assert "it does not start: no station could drive" in revoked.output
+    assert "does not start with these files, because no station could drive" in revoked.output
     assert "security router" in revoked.output

@@ -184,7 +184,7 @@ def test_the_commands_from_nothing_to_rules(tmp_path: Path):
     assert added.exit_code == 0
     assert "restart it while the robot stands" in added.output
     again = run.invoke(app, ["security", "add", "ann", "--role", "engineer", "--rank", "gamepad", *folder])
-    assert "The robot needs nothing" in again.output
+    assert "The robot needs no new files" in again.output
     shown = run.invoke(app, ["security", "show", "--json", *folder])
     assert [row["name"] for row in json.loads(shown.stdout)] == ["authority", "truck", "ann"]
     printed = json.loads(run.invoke(app, ["security", "rules", *folder]).stdout)

@@ -112,7 +112,7 @@ def test_which_of_two_that_were_gone_together_it_is_is_not_guessed():
     track.take(0, alike((-0.5, 0.0, 0.0), (0.5, 0.0, 0.0)))
     assert track.take(SECOND, alike((0.1, 0.4, 0.0))) == []
     (said,) = track.complaints(SECOND)
-    assert said.startswith("robots a, b look alike and were out of sight together: put them to their starts")
+    assert said.startswith("robots a, b look alike and were out of sight together: place them at their starts")
     assert track.take(2 * SECOND, alike((0.1, 0.4, 0.0))) == []
     assert track.complaints(2 * SECOND) == []
     # One of them at its start says who the other is.
@@ -161,9 +161,9 @@ ROBOT = "{ front: red, rear: blue, apart: 0.1 }"
         ("robots: {}", "expected a robot"),
         ("robots: { a: { tag: 1 } }\nblobs: { a: { front: red, rear: blue, apart: 0.1 } }", "a: expected in robots or"),
         ("robots: { a: { tag: 1 }, b: { tag: 1 } }", "tag 1: expected on one robot"),
-        ("robots: { a: { tag: 100 } }", "tag 100: expected on one robot, and not among the marks"),
+        ("robots: { a: { tag: 100 } }", "tag 100: expected on one robot only, and not among the marks"),
         ("blobs: { a: { front: red, rear: red, apart: 0.1 } }", "front and rear are red"),
-        (f"blobs: {{ a: {ROBOT}, b: {{ front: blue, rear: red, apart: 0.1 }} }}", "blobs.a has the colours of b"),
+        (f"blobs: {{ a: {ROBOT}, b: {{ front: blue, rear: red, apart: 0.1 }} }}", "blobs.a has the same colours as b"),
     ],
 )
 def test_robots_that_cannot_be_distinguished_are_refused(tmp_path, robots, said):

@@ -54,7 +54,7 @@ class Robot:
 
 def test_why_a_robot_gets_no_poses_is_said_once(monkeypatch: pytest.MonkeyPatch):
     def refuse(*_: object, **__: object) -> None:
-        raise NotPermittedError("station.key: others may read it")
+        raise NotPermittedError("station.key: other users may read it")
 
     async def main(clock: VirtualClock) -> None:
         monkeypatch.setattr(client, "TruckClient", refuse)
@@ -62,7 +62,7 @@ def test_why_a_robot_gets_no_poses_is_said_once(monkeypatch: pytest.MonkeyPatch)
         running = asyncio.create_task(RobotLink("truck", "tls/there", clock, said.append).run())
         await clock.sleep(20.0)
         running.cancel()
-        assert said == ["robot truck: station.key: others may read it"]
+        assert said == ["robot truck: station.key: other users may read it"]
 
     run_virtual(main)
 
@@ -86,7 +86,7 @@ def test_poses_are_stamped_by_the_robots_clock(behind: float, error: float, monk
         await clock.sleep(GONE + 0.5)
         link.put(seen)
         assert len(robot.poses) == 1, "it is gone"
-        assert said == ["robot truck: gets its poses", "robot truck: is not there, or silent"]
+        assert said == ["robot truck: receives its poses", "robot truck: is silent or not running"]
         running.cancel()
         with suppress(asyncio.CancelledError):
             await running

@@ -204,11 +204,11 @@ def test_a_lost_camera_and_one_that_looks_elsewhere_are_named(stand):
     for k in range(100):
         tracker.take(k * SECOND // 10, good if k < 30 else {"c1": []})
         said += tracker.complaints(k * SECOND // 10)
-    assert "camera c2 sends no picture for 1 s" in said
-    assert "camera c1 sees none of its marks for 5 s: it is left out, calibrate the stand again" in said
+    assert "camera c2 has sent no image for 1 s" in said
+    assert "camera c1 has seen none of its marks for 5 s: it is ignored; calibrate the stand again" in said
     assert len(said) == 2
     tracker.take(10 * SECOND, good)
-    assert "camera c2 sends pictures again" in tracker.complaints(10 * SECOND)
+    assert "camera c2 sends images again" in tracker.complaints(10 * SECOND)
 
 
 def test_errors_of_the_ruler_do_not_look_like_a_camera_that_has_moved():
@@ -266,11 +266,11 @@ def test_a_mark_that_was_measured_wrong_is_named(stand):
     check_places(place(camera.lens, seen, config.marks), seen, config.marks, 0.0015)
     for tag in seen:
         wrong = {**config.marks, tag: MarkConfig(x=config.marks[tag].x + 0.05, y=config.marks[tag].y)}
-        with pytest.raises(InputError, match=rf"a mark is not where it should be, marks.{tag} by (49|50|51) mm"):
+        with pytest.raises(InputError, match=rf"a mark is not at its configured place, marks.{tag} by (49|50|51) mm"):
             check_places(place(camera.lens, seen, wrong), seen, wrong, 0.0015)
     first, second, *_ = seen
     swapped = {**config.marks, first: config.marks[second], second: config.marks[first]}
-    with pytest.raises(InputError, match=r"marks are not where they should be, marks\."):
+    with pytest.raises(InputError, match=r"marks are not at their configured places, marks\."):
         check_places(place(camera.lens, seen, swapped), seen, swapped, 0.0015)
 
 

@@ -107,7 +107,7 @@ def test_it_shows_what_matters():
         "backoff",
         "  gate: tilted",
         "roll +5.7° pitch +11.5°",
-        "2.9° off the level",
+        "2.9° from level",
         "▲",
     ):
         assert words in text
@@ -335,7 +335,7 @@ def test_a_robot_that_fell_silent_is_not_shown_as_alive():
     console = shown(state)
     styled = console.export_text(clear=False, styles=True)
     text = console.export_text()
-    assert text.startswith("no word of the robot for 12 s")
+    assert text.startswith("no data from the robot for 12 s")
     assert "DRIVING" in text
     assert styled.count("\x1b[1;37;41m") == 1, "white on red"
     assert set(re.findall(r"\x1b\[([\d;]+)m", styled)) == {"1;37;41", "90", "0"}, "all else is grey"

@@ -66,7 +66,7 @@ def test_a_run_that_was_stopped_at_once_is_named_and_does_not_hide_the_others(tm
     assert result.exit_code == 0
     (circle,) = json.loads(result.stdout)["circles"]
     assert circle["radius"] == pytest.approx(0.2, rel=1e-3)
-    assert "left out: 2:1, 1.50 rad/s: 0 poses" in result.stderr
+    assert "skipped: 2:1, 1.50 rad/s: 0 poses" in result.stderr
 
 
 def test_runs_of_which_none_says_anything_are_one_line(tmp_path):

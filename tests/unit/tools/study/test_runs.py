@@ -73,7 +73,7 @@ class Stopping:
 @pytest.mark.parametrize("offset", [-1e6, 0.0, 1e6])
 @pytest.mark.parametrize(
     ("vanishes", "said"),
-    [(False, "the robot stopped on the way: no fresh lidar scan"), (True, "the robot has been silent for 2 s")],
+    [(False, "the robot stopped during the run: no fresh lidar scan"), (True, "the robot has been silent for 2 s")],
 )
 def test_a_robot_that_stops_or_vanishes_ends_the_run_whenever_its_computer_was_started(
     offset: float, vanishes: bool, said: str
