@@ -385,7 +385,7 @@ async def test_calls_with_huge_payloads_are_refused_before_anybody_parses_them()
             huge = await asyncio.to_thread(ask, b'{"x": "' + b"x" * 10_000_000 + b'"}')
             largest = await asyncio.to_thread(ask, b'{"x": "' + b"x" * (MAX_CALL - 9) + b'"}')
             nested = await asyncio.to_thread(ask, b"[" * MAX_CALL)
-    assert huge == ("bad_input", f"payload of 10000009 bytes, at most {MAX_CALL} are taken")
+    assert huge == ("bad_input", f"payload of 10000009 bytes, at most {MAX_CALL} are accepted")
     assert largest[0] == "ok"
     assert nested[0] == "bad_input"
 

@@ -162,7 +162,7 @@ async def test_a_taken_port_and_two_robots_of_one_name_are_refused():
     async with serving() as (station, _):
         with pytest.raises(BusyError, match=str(station.place.port)):
             await Station([NOBODY], WallClock(), station.place).run()
-    with pytest.raises(InputError, match="one name"):
+    with pytest.raises(InputError, match="the same name"):
         Station([NOBODY, NOBODY], WallClock())
 
 

@@ -119,7 +119,7 @@ def test_ramp_world_tilts_the_truck():
     ("text", "match"),
     [
         ("points: [[0, 1]]", "two points"),
-        ("points: [[1, 0], [0, 0]]", "rising"),
+        ("points: [[1, 0], [0, 0]]", "increasing"),
         ("point: 3", "list of"),
         ("a: [", ":1: not valid YAML"),
     ],
