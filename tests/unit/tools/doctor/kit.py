@@ -4,6 +4,7 @@ import asyncio
 import os
 from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from monstertruck_drivers.usb.tree import DEVICES
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_sim.computer import EmulatedComputer
 from monstertruckd.config.load import load_truck
+from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.doctor.context import Account, Finding, HostContext, Level
 from monstertruckd.tools.install.apply import install
 from monstertruckd.tools.install.plan import plan
@@ -67,9 +69,14 @@ class EmulatedHost:
         return sorted((self.folder / "sys" / DEVICES).glob("*/ttyUSB*/latency_timer"))
 
 
+@cache
+def truck() -> TruckConfig:
+    return load_truck(TRUCK)[0]
+
+
 def emulated(folder: Path, clock: VirtualClock) -> EmulatedHost:
     """Everything installed, plugged in, permitted, synchronized."""
-    config = load_truck(TRUCK)[0]
+    config = truck()
     cables = {role: MemoryPort(role) for role in config.devices.present()}
     computer = EmulatedComputer(folder, config.devices, cables, clock)
     for node in NODES:
