@@ -13,7 +13,7 @@ from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.sensor import Imu, Vector3, WheelEncoders
 from monstertruck_schemas.state import Consistency, StandingBody
 from monstertruckd.gate.config import ContactConfig, GateConfig, weakened
-from monstertruckd.gate.contact import ContactCheck
+from monstertruckd.gate.contact import ContactCheck, Lasting
 from tests.unit.gate.rig import DRIVETRAIN, Rig, check_of, header
 
 ROLLING, PUSHING = 0.15, 0.54
@@ -259,6 +259,29 @@ def test_a_body_that_does_not_turn_is_noticed():
     turning[0] = False
     assert rig.until(Reason.CONTACT) <= 0.3
     assert rig.trips[-1].causes[0].measurements[0].name == "speed of body"
+
+
+@pytest.mark.parametrize(("angle", "obeys"), [(0.03, True), (0.4, False)])
+def test_a_slow_turn_and_one_that_has_not_begun_show_nothing_by_the_gyroscope(angle, obeys):
+    """Its bias is as large as the one; the other is what the motor has not done yet."""
+    rig = Backing(blocked=None)
+    rig.driver = {"speed": -0.15, "front": angle, "rear": -angle, "unseen": True}
+    if not obeys:
+        rig._obey = lambda: None
+
+    def gyro():
+        zero = Vector3(x=0.0, y=0.0, z=0.0)
+        rig.gate.observe(Imu(**header(rig.now), angular_velocity=zero, linear_acceleration=zero), topics.IMU)
+
+    rig.extra = gyro
+    assert rig.until(Reason.CONTACT) is None
+    assert abs(rig.out.twist[2]) > 0.005
+
+
+def test_a_condition_lasts_from_the_first_message_that_shows_it():
+    lasting, step = Lasting(), SECOND // 20
+    shown = [lasting.holds(9 * SECOND + k * step, 0.15, true=k != 5) for k in range(10)]
+    assert shown == [False, False, False, True, True, False, False, False, False, True]
 
 
 @pytest.mark.parametrize("driver", [{"vx": -0.15, "unseen": True}, (-0.15 / DRIVETRAIN.wheel_radius,)])

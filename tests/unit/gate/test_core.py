@@ -452,3 +452,26 @@ def test_the_first_tick_is_one_period_and_no_pause():
     assert Reason.TICK_STALLED not in rig.out.reasons
     assert rig.order(Order.ARM) is Reason.OK
     assert TICK == SECOND // 50
+
+
+def test_every_ordered_stop_is_reported_however_soon_it_follows_another():
+    rig = Rig()
+    rig.driving(speed=0.1, role=Role.STATION)
+    for _ in range(2):
+        rig.order(Order.STOP, role=Role.STATION)
+        rig.driver = None
+        rig.drive(speed=0.0, role=Role.STATION)
+        rig.tick(15)
+        rig.driver = {"speed": 0.1, "role": Role.STATION}
+        rig.tick(5)
+        assert rig.out.mode is GateMode.DRIVING
+    assert [event.text for event in rig.reported(Reason.STOPPED)].count("stop ordered by ann") == 2
+
+
+def test_an_order_to_arm_is_refused_for_the_first_of_several_reasons():
+    rig = Rig()
+    rig.silent = {"scan", "steering"}
+    rig.tick(40)
+    blocks = rig.gate._checks.blocks(rig.now)
+    assert len(blocks) > 1
+    assert rig.order(Order.ARM) is blocks[0]

@@ -1,5 +1,6 @@
 """The script that stops the drives after any death of the daemon, byte by byte against a controller on a pty."""
 
+import contextlib
 import importlib.util
 import os
 import select
@@ -335,3 +336,20 @@ def test_a_line_without_a_carrier_holds_up_nothing(neutral, monkeypatch):
     assert flags[0] & os.O_NONBLOCK
     assert termios.tcgetattr(controller.slave)[2] & termios.CLOCAL
     controller.close()
+
+
+def test_a_board_that_stays_silent_is_given_up_after_its_time(neutral, monkeypatch):
+    now, asked = [1000.0], []
+
+    def silent(line):
+        asked.append(line)
+        now[0] += 0.25
+        raise neutral.NotStoppedError("no answer")
+
+    monkeypatch.setattr(neutral, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(neutral, "some", silent)
+    monkeypatch.setattr(neutral, "opened", lambda port, baud: contextlib.nullcontext(0))
+    monkeypatch.setattr(neutral, "os", SimpleNamespace(write=lambda line, data: None))
+    with pytest.raises(neutral.NotStoppedError, match="no answer"):
+        neutral.stop_board("board", "", 57600)
+    assert len(asked) == neutral.ATTEMPT / 0.25
