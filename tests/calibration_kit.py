@@ -545,12 +545,15 @@ class Verdict:
 
 
 def distance_from_fit(plot: Plot) -> float:
-    """Median distance of the measurements from the fit, as a fraction of the plot's ranges; 0 without a fit."""
+    """Median distance of the measurements from the fit, as a fraction of the ranges on both axes; 0 without a fit.
+
+    A range less than 1 % of its values counts as 1 % of them: the spread of a repeated measurement.
+    """
     assert np.isfinite(plot.points).all()
     if plot.curve is None:
         return 0.0
     everything = np.vstack((plot.points, plot.curve))
-    low, span = everything.min(axis=0), np.maximum(np.ptp(everything, axis=0), 1e-9)
+    low, span = everything.min(axis=0), np.maximum(np.ptp(everything, axis=0), 0.01 * np.abs(everything).max(axis=0))
     points, curve = (plot.points - low) / span, (plot.curve - low) / span
     along = np.linspace(0, len(curve) - 1, 1000)
     dense = np.column_stack([np.interp(along, np.arange(len(curve)), axis) for axis in curve.T])

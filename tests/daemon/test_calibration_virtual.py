@@ -105,7 +105,7 @@ def test_compass(tmp_path: Path):
 
 @pytest.mark.long
 def test_drive_whose_sign_is_wrong_and_whose_next_start_is_right(tmp_path: Path):
-    config, rng = yard(tmp_path, 3, "drive")
+    config, rng = yard(tmp_path, 5, "drive")
     assert config.sim.world.truck.motor.inverted is False
     wizard = DriveWizard(runs=3)
     sign = run_session(config, wizard, rng)
