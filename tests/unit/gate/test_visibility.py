@@ -12,7 +12,7 @@ from monstertruck_schemas.req import Order
 from monstertruck_schemas.sensor import HIDDEN, VALID_BEAM
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.obstacles import OUTLINE, ObstacleCheck, ground_ahead
-from monstertruckd.gate.visibility import SECTOR, SECTORS, Visibility, travelled
+from monstertruckd.gate.visibility import SECTORS, Visibility, travelled
 from tests.unit.gate.rig import Rig, check_of, scan
 
 FOOTPRINT = Footprint()
@@ -261,7 +261,7 @@ MIDDLE = SECTORS // 2
 
 def looked(visibility, ranges, codes=None, *, stamp=SECOND, first=MIDDLE * BEAMS, left=True):
     """When each sector of the field was seen, after a scan whose beams begin at the ``first`` one from the rear."""
-    step = SECTOR / BEAMS
+    step = math.tau / SECTORS / BEAMS
     ends = [-math.pi + (first + i + 0.5) * step for i in (0, len(ranges) - 1)]
     begin, end = ends if left else reversed(ends)
     codes = [255 if math.isfinite(distance) else 7 for distance in ranges] if codes is None else codes

@@ -6,15 +6,15 @@ from contextlib import suppress
 import pytest
 
 from monstertruck_runtime.clock import WallClock
-from monstertruckd.station import discovery
 from monstertruckd.station.discovery import Discovery
 from tests.bus_kit import free_endpoint
 
 
 async def test_why_a_router_shows_no_robots_is_said_once(caplog: pytest.LogCaptureFixture, monkeypatch):
-    monkeypatch.setattr(discovery, "ROUTER_RETRY", 0.05)
     endpoint = free_endpoint()
-    watching = asyncio.create_task(Discovery(endpoint, WallClock(), lambda _: None).run())
+    discovery = Discovery(endpoint, WallClock(), lambda _: None)
+    monkeypatch.setattr(discovery, "_retry", 0.05)
+    watching = asyncio.create_task(discovery.run())
     await asyncio.sleep(0.6)
     watching.cancel()
     with suppress(asyncio.CancelledError):
