@@ -149,6 +149,7 @@ class Reason(StrEnum):
     UNWITNESSED = "unwitnessed", 109, "no second sensor measures the robot's motion: speed limited"
     SENSORS_AGREE = "sensors_agree", 0, "the sensors agree again"
     ENCODERS_DISAGREE = "encoders_disagree", 89, "an encoder of the rear wheels reports an impossible motion"
+    MAP_CHANGED = "map_changed", 97, "what the map shows around the robot is gone"
     OUTSIDE_MAP = "outside_map", 97, "the scans match no place on the saved map"
     WHEEL_GRIP = "wheel_grip", 0, "the wheels grip again"
     IMU_AGREES = "imu_agrees", 0, "the yaw rate of the IMU is used again"

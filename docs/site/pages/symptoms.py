@@ -134,6 +134,7 @@ SYMPTOMS: Final = (
             "odometry_dropped": "Check the wheels; calibrate drive and odometry.",
             "pose_lost": "Drive slowly where the lidar sees many walls.",
             "match_degenerate": "A bare corridor: the pose continues by odometry.",
+            "map_changed": "Map every floor by itself.",
             "outside_map": "Check that the map is of this place: `monstertruckd map localise`.",
             "scan_left_out": "Tilted or covered: level the lidar.",
         },

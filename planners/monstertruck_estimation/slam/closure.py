@@ -439,17 +439,25 @@ def opposed(keyframes: KeyframeMap, own: NDArray[np.intp], others: NDArray[np.in
     """
     counts = yield from crossings(keyframes, own, others)
     through, judged = counts.sum(axis=0)
-    # Maximum contradiction of two submaps (share of the points in view of both that one looked through), as a whole
-    # and along a stretch: right joins of recordings had at most 0.05 and 0.15, wrong ones in six of seven drives
-    # through equal rooms 0.18 and more.
-    join_contradiction = (0.1, 0.18)
-    if through > join_contradiction[0] * judged:
-        return True
-    join_stretch = 6  # keyframes of a stretch
-    if len(counts) < join_stretch:
+    # Maximum contradiction of two submaps (share of the points in view of both that one looked through): right joins of
+    # recordings had at most 0.05, and 0.15 along a stretch.
+    join_contradiction = 0.1
+    return bool(through > join_contradiction * judged) or stretch_contradicts(counts)
+
+
+STRETCH: Final = 6
+"""Keyframes of a stretch."""
+
+
+def stretch_contradicts(counts: Array) -> bool:
+    """Whether along any stretch too many points are looked through; ``counts``, shape (k, 2), of ``crossings``."""
+    if len(counts) < STRETCH:
         return False
-    stretches = np.lib.stride_tricks.sliding_window_view(counts, join_stretch, axis=0).sum(axis=-1)
-    return bool((stretches[:, 0] > join_contradiction[1] * stretches[:, 1]).any())
+    stretches = np.lib.stride_tricks.sliding_window_view(counts, STRETCH, axis=0).sum(axis=-1)
+    # Maximum share along a stretch: right joins of recordings had at most 0.15, wrong ones in six of seven drives
+    # through equal rooms 0.18 and more.
+    stretch_contradiction = 0.18
+    return bool((stretches[:, 0] > stretch_contradiction * stretches[:, 1]).any())
 
 
 def surroundings(keyframes: KeyframeMap, centre: int) -> tuple[NDArray[np.intp], Scan]:

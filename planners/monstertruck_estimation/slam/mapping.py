@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_estimation.slam.budget import ScanBudget
+from monstertruck_estimation.slam.changes import ChangeDetector
 from monstertruck_estimation.slam.closure import CONTRADICTION, PART_CONTRADICTION, LoopCloser
 from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.correlation import Submap
@@ -71,6 +72,8 @@ class MappingEvent(StrEnum):
     """Two submaps were joined."""
     PARTED = "parted"
     """Their join was wrong and is undone."""
+    CHANGED = "changed"
+    """What the map shows around the robot is gone, as on another floor."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +122,7 @@ class Mapper:
         self._loss = LossDetector()
         self._movers = MoverDetector()
         self._relocation = Relocation()
+        self._changes = ChangeDetector()
 
     @property
     def lost(self) -> bool:
@@ -364,9 +368,12 @@ class Mapper:
             kept, stand_in, offset = self.map.prune()
             self._trajectory.move(stand_in, offset)
             self._closer.forget(kept)
+            self._changes.forget()
             self._relocation.forget()
         self._since_key = (np.zeros(3), np.zeros((3, 3)))
         self._look_around()
+        if self._changes.take(self.map, self._local):
+            events += (MappingEvent.CHANGED,)
         return events
 
     def _append_to_trajectory(self, stamp: int) -> None:

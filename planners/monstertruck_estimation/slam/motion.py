@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.scan_matcher import LOW_OVERLAP, ScanMatch, deviations, difference
+from monstertruck_estimation.slam.wheel_scale import WheelScale
 from monstertruck_estimation.slam.worker_io import ScanIncrement
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Twist2, between, compose, rotation
@@ -220,6 +221,10 @@ class MotionPredictor:
         self._squares = np.ones(2)
         self._odom: Array | None = None
         self._by_odometry: tuple[Array, Array] | None = None
+        """Motion by odometry with the wheels' scale, and its covariance."""
+        self._raw = np.zeros(3)
+        """The same motion as odometry states it."""
+        self._scale = WheelScale(config.odometry_distance, config.odometry_floor[0])
         self._alone = LastMotionPredictor(config)
         self._by_motion = np.zeros(3), np.zeros((3, 3))
         self._delta = np.zeros(3)
@@ -283,7 +288,10 @@ class MotionPredictor:
         if delta is not None and math.hypot(delta[0], delta[1]) > config.fastest[0] * dt + config.fastest[1]:
             delta = None
         self._odom = now
-        self._by_odometry = None if delta is None else (delta, self._noise(delta))
+        self._by_odometry = None
+        if delta is not None:
+            self._raw, delta = delta, delta * (self._scale.factor, self._scale.factor, 1.0)
+            self._by_odometry = delta, self._noise(delta)
         self._by_motion = self._alone.predict(dt)
         if self._by_odometry is None:
             return self._by_motion
@@ -334,11 +342,18 @@ class MotionPredictor:
         # The first motion after a misfit corrects the wrong prediction at the misfit.
         if self._by_odometry is None or not (fitted and self._fitted):
             self.check.interrupt(dt)
+            self._scale.interrupt()
             return
         by_odometry = self._by_odometry[0]
         # Along a corridor the match takes the distance from the prediction; only its turn is measured.
-        compared = (*by_odometry[:2], moved[2]) if match.degenerate else moved
-        self.check.add(dt, by_odometry, np.array(compared), seen=not match.degenerate)
+        compared = (*self._raw[:2], moved[2]) if match.degenerate else moved
+        self.check.add(dt, self._raw, np.array(compared), seen=not match.degenerate)
+        if self.check.contradicted:
+            self._scale.reset()
+        elif _is_clear(match):
+            self._scale.add(self._raw, moved)
+        else:
+            self._scale.interrupt()
         if not _is_clear(match) or delta is not by_odometry:
             return
         off = between(delta, moved)

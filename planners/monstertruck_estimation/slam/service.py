@@ -44,6 +44,7 @@ UNMATCHED: Final = SECOND
 CORRECTIONS: Final = {
     "closed": (Reason.LOOP_CLOSED, Severity.INFO, "closure {}"),
     "joined": (Reason.LOOP_CLOSED, Severity.INFO, "two submaps are joined"),
+    "changed": (Reason.MAP_CHANGED, Severity.WARNING, "another floor, or walls have moved: save a map of its own"),
     "parted": (Reason.JOIN_UNDONE, Severity.WARNING, "later scans contradict it"),
 }
 """Event text of a step that has corrected the map; {} is the number of closures."""

@@ -157,6 +157,16 @@ def test_a_fault_of_the_lidars_mount_is_reported_once(monkeypatch, tmp_path: Pat
     assert events_of(story, monkeypatch, tmp_path) == [(Reason.LIDAR_TURNED, "the lidar is turned")]
 
 
+def test_another_floor_is_a_warning(monkeypatch, tmp_path: Path):
+    FakeWorker.statuses[:], FakeWorker.happened[:] = [LocalisationStatus.MAPPING], [("key", "changed")]
+
+    async def story(clock, scans, service):
+        scans.put(scan(clock))
+        await clock.sleep(0.2)
+
+    assert [reason for reason, _ in events_of(story, monkeypatch, tmp_path)] == [Reason.MAP_CHANGED]
+
+
 def test_with_scans_it_is_saved_once_with_the_next_one(monkeypatch, tmp_path: Path):
     async def story(clock, scans, service):
         for k in range(40):
