@@ -162,7 +162,7 @@ def test_the_command_takes_every_answer_as_an_option(tmp_path: Path):
         ([*options(ANT), "--drive", "hamster"], "--drive: expected 'vesc', 'arduino_bridge'"),
         ([*options(ANT), "--speed", "fast"], "--speed: expected a number"),
         ([*options(ANT), "--lidar", "sick"], "lidar sick: expected none or one of hokuyo_urg"),
-        ([*options(ANT), "--lidar", "rplidar:c9"], "lidar rplidar:c9: model: Input should be 'a1', 'a2'"),
+        ([*options(ANT), "--lidar", "rplidar:c9"], "lidar rplidar:c9: model: expected 'a1', 'a2'"),
         ([*options(ANT), "--lidar", "hokuyo_urg:04"], "lidar hokuyo_urg:04: hokuyo_urg has one model"),
         ([*options(ANT), "--steering", "maestro"], "steering maestro: body differential steers nothing; expected none"),
         (
