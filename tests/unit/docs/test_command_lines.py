@@ -128,6 +128,20 @@ def test_nothing_is_replaced_that_is_not_there():
     assert there >= set(SERVING)
 
 
+def test_the_tests_that_reasons_name_are_there():
+    reasons = [*(instead.why for instead in INSTEAD.values()), *FOREIGN.values()]
+    named = {
+        name for text in reasons for name in re.findall(r"(?:(?:tests|benchmarks)/[\w/]*)?\b\w+\.py|tests/\S+", text)
+    }
+    there = [
+        file.relative_to(ROOT).as_posix() for top in ("tests", "benchmarks") for file in (ROOT / top).rglob("*.py")
+    ]
+    assert len(named) > 10
+    assert [
+        name for name in named if not any(f"/{file}".endswith(f"/{name}") or f"{name}/" in file for file in there)
+    ] == []
+
+
 @pytest.mark.parametrize(("page", "text"), sorted(set(inline())), ids=lambda word: word)
 def test_what_sentences_name_is_there(page: str, text: str):
     if "benchmarks/" in text:
