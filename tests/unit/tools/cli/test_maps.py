@@ -35,7 +35,7 @@ def test_a_trajectory_with_the_geometry_that_was_given(log: Path, tmp_path: Path
         app, ["map", "build", *map(str, arguments), "--range-max", "5.6", "--mount", "0", "0", "0"]
     )
     assert result.exit_code == 0, result.output
-    assert "holds no range_min, time_increment" in result.stderr
+    assert "contains no range_min, time_increment" in result.stderr
     facts = json.loads(result.stdout)
     assert "60 poses" in facts["trajectory"]
     assert facts["poses"] in {"joint registration", "graph"}
@@ -154,7 +154,7 @@ def test_a_log_by_another_program_becomes_a_map(tmp_path: Path):
     log = DATA / "foxglove_scans.mcap"
     done = CliRunner().invoke(app, ["map", "build", str(log), "-o", str(tmp_path / "map"), "--json"])
     assert done.exit_code == 0, done.output
-    assert "holds no range_min, range_max, mount" in done.stderr
+    assert "contains no range_min, range_max, mount" in done.stderr
     assert json.loads(done.stdout)["scans"] == 50
     plain = tmp_path / "plain.yaml"
     save_map(WorldMap(np.zeros((10, 10), np.int8), 0.05), plain)

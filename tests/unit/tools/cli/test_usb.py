@@ -272,7 +272,7 @@ def test_find_port_prints_the_line_and_writes_it(tmp_path: Path, monkeypatch: py
 def test_find_port_knows_the_roles_there_are(role: str):
     result = CliRunner().invoke(app(), ["find-port", role])
     assert isinstance(result.exception, InputError)
-    assert f"no role '{role}'; known: lidar, drive" in str(result.exception)
+    assert f"no role '{role}'; known: lidar, lidar_2, drive" in str(result.exception)
 
 
 def test_find_port_asks_nothing_that_it_could_not_write(tmp_path: Path):
