@@ -56,6 +56,7 @@ HARMLESS = {
         **dict.fromkeys(
             ("max_bad_scans", "stale_periods", "first_scan_periods", "line_timeout", "verify_timeout"), SEEN
         ),
+        "hidden": "outside the field of view: the gate takes this ground for unseen",
         "clock_samples": "stamps later than gate.max_latency are not valid",
     },
     Os4000Config: {
