@@ -52,12 +52,12 @@ and daemons on the wall clock would be late."""
 THREE = ("-n", "3")
 """Other tests at a time: some wait for a process or a time-out."""
 WALL = (*TWO, *TESTS, "-m", "wall and not long", "-o", "cache_dir=.pytest_cache/wall")
-"""Tests on the wall clock. They run together with the other tests, and need a cache of their own for failed tests."""
+"""Tests on the wall clock. They run together with the other tests, and need a separate cache for failed tests."""
 LESS_URGENT = (Path("nice"), "-n", "5")
 """Start of the command of the other tests: tests on the wall clock get the processor first."""
 FAILED_ALONE = ("-n", "0", "--last-failed", "--last-failed-no-failures", "none", "--cov-append", "--assert", "rewrite")
 KERNELS: tuple[Path, str, str] = (VENV / "bin" / "python", "-m", "monstertruckd.tools.install.kernels")
-"""Compiles what goals and maps need, and names each part."""
+"""Compiles the kernels of goals and maps, and names each part."""
 BYTECODE = ("-m", "compileall", "-q", "-j", "2", "monstertruckd", "drivers", "planners", "schemas", "tests")
 """Python's arguments that compile our own packages and the tests, once for the hundreds of processes that the tests
 start: where PYTHONDONTWRITEBYTECODE is set none of them would leave its work to the next."""
@@ -89,7 +89,7 @@ def main(arguments: list[str]) -> int:
 
 
 def compile_kernels() -> int:
-    """Compile what goals and maps need; the exit code."""
+    """Compile the kernels of goals and maps; return the exit code."""
     print(
         "Step 2 of 3: compiling the kernels of planners and mapping: seconds, a minute or two the first time ...",
         file=sys.stderr,

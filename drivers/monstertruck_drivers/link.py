@@ -95,7 +95,7 @@ class Link:
         """Everything received so far.
 
         Args:
-            within: seconds to wait for it; None = no limit.
+            within: seconds to wait for it; None: no limit.
             least: bytes worth waking for.
 
         Raises:
@@ -115,7 +115,7 @@ class Link:
 
         Args:
             count: how many.
-            within: seconds to wait for the last one; None = no limit.
+            within: seconds to wait for the last one; None: no limit.
 
         Raises:
             DeviceLostError: the link went down before they came.

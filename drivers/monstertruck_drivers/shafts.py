@@ -27,9 +27,9 @@ class SteeringOutputs(NamedTuple):
     """For every servo of a ``SteeringCommand``, in its order: servo angles, rad, to the right (negative) and to the
     left. Both are 0 where the controller has no output for it."""
     dead_time: float | None
-    """Dead time from a command to the first movement of the wheels (s); None = not measured."""
+    """Dead time from a command to the first movement of the wheels (s); None: not measured."""
     lag: float | None
-    """Time constant of the wheels' movement after the dead time (s); None = not measured."""
+    """Time constant of the wheels' movement after the dead time (s); None: not measured."""
 
     @property
     def axles(self) -> tuple[tuple[float, float], tuple[float, float]]:

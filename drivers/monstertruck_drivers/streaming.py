@@ -33,7 +33,7 @@ class DeviceStream(Generic[T]):
         """Return the messages that became complete with the next bytes, perhaps none.
 
         Args:
-            within: seconds to wait for the bytes; None = no limit.
+            within: seconds to wait for the bytes; None: no limit.
 
         Raises:
             DeviceLostError: unplugged.

@@ -60,7 +60,7 @@ class SimConfig(Schema):
     """Seconds of the servo controller's own serial time-out (0 = off, as delivered)"""
     as_built: bool = False
     """What ``world`` does not state of the robot (body, geometry, mounts, servos, motor, pack) follows from the rest of
-    the configuration; otherwise it is the Monstertruck's"""
+    the configuration; otherwise the Monstertruck is used"""
     world: WorldConfig = WorldConfig()
     stand: StandConfig = StandConfig()
     """How `stand: simulator` sees the robot"""

@@ -37,7 +37,7 @@ class SimulatedRobot:
         ports: one emulated port per device role; ``run`` plugs them in.
         root: folder of the emulated computer, for its monitors.
         offload: where the camera's pictures are drawn.
-        scene: world that it shares with other robots; None = its own.
+        scene: world that it shares with other robots; None: its own.
         name: name of the robot.
     """
 
@@ -65,7 +65,7 @@ class SimulatedRobot:
         self.monitored: dict[str, FileEmulator] = {
             role: emulated(role, kind_of(settings), settings) for role, settings in monitors.present().items()
         }
-        """What the computer's files show, by monitor."""
+        """Values of the computer's files, by monitor."""
         self._kinds = {role: device.kind for role, device in devices.present().items()}
         self.emulators: dict[str, Emulator] = {
             role: emulated(role, device.kind, device.driver) for role, device in devices.present().items()

@@ -18,8 +18,8 @@ class SimulatedStand:
         config: rate and noise.
         world: with the robot in it.
         clock: time.
-        put: gets every pose.
-        seed: seed of the noise; None = none.
+        put: called with every pose.
+        seed: seed of the noise; None: none.
     """
 
     def __init__(
@@ -30,7 +30,7 @@ class SimulatedStand:
         self._count = 0
 
     async def run(self) -> None:
-        """Look until cancelled."""
+        """Observe until cancelled."""
         due = self._clock.now()
         while True:
             self._put(self.look())
@@ -38,7 +38,7 @@ class SimulatedStand:
             await self._clock.sleep_until(due)
 
     def look(self) -> StandPose:
-        """The pose at this moment."""
+        """Current pose."""
         now, config = self._clock.now(), self._config
         truth = self._world.truth(now)
         x, y, turn = (0.0, 0.0, 0.0) if self._noise is None else self._noise.at(self._count)

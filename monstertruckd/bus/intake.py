@@ -52,7 +52,7 @@ class Limit:
     size: int = 2048
     """Bytes of one request."""
     rate: float | None = 5.0
-    """Requests a second of one owner, in bursts of as many; None = any number."""
+    """Requests a second of one owner, in bursts of as many; None: any number."""
 
 
 LIMITS: Final = {

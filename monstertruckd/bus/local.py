@@ -126,7 +126,7 @@ class Bus:
         """A read end of ``topic``; for a retained topic it holds the latest message at once.
 
         Raises:
-            RuntimeError: it is what a test stand sees, which nothing in the robot may know.
+            RuntimeError: the topic is written by a test stand and must not be read in the robot.
         """
         _require_own(topic)
         mailbox: Mailbox[M] = Mailbox(delivery, lambda closed: self._forget(topic.name, closed))

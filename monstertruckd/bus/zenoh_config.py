@@ -148,9 +148,9 @@ class Listener:
     """Sessions of others that may be open at once."""
     connect: tuple[str, ...] = ()
     ca: Path | None = None
-    """Who may connect; None = everybody."""
+    """Who may connect; None: everybody."""
     grants: dict[str, Grant] | None = None
-    """Rights by name on the certificate; None = all rights to everybody."""
+    """Rights by name on the certificate; None: all rights to everybody."""
     routers: tuple[str, ...] = ()
     """Names on the certificates of a fleet's routers."""
     guarded: bool = False

@@ -1,7 +1,7 @@
 """Assisted driving: turns an operator's motion to the nearest curvature whose swept ground is free.
 
-The operator's speed is never raised, and a request for standstill stays one. All checks of the gate see the turned
-motion as if the operator had asked for it.
+It never increases the operator's speed, and never changes a request for standstill. All checks of the gate see the
+turned motion as if the operator had requested it.
 """
 
 import math
@@ -94,12 +94,12 @@ class Assist(Check):
         self._guard = guard
         self._turned = False
         self._chosen: tuple[tuple[float, ...], float] = ((), 0.0)
-        """What the latest choice depends on, and the turn chosen (rad)."""
+        """Inputs of the latest choice, and the chosen turn (rad)."""
 
     def instead(self, request: DriveRequest | None, now: int) -> DriveRequest | None:
-        """Return the request to be driven: the operator's, or one that turns more or less; None if none is assisted.
+        """Return the request to drive, with an assisted turn; None if no request can be assisted.
 
-        With the second control the operator has confirmed the ground on the asked motion, and on no other.
+        The second control confirms only the ground on the requested motion.
         """
         self._turned = False
         view = self.view
@@ -124,7 +124,7 @@ class Assist(Check):
         return request.model_copy(update={"front": front, "rear": rear}) if self._turned else request
 
     def _choose(self, request: DriveRequest, now: int) -> float:
-        """Return by how much each axle turns further than asked (rad)."""
+        """Return the additional turn of each axle compared with the request (rad)."""
         config, bicycle = self.view.config, self.view.chassis.bicycle
         # Both ends turn the axles to their limit, whatever the request.
         most = config.angle + max(abs(request.front), abs(request.rear))
@@ -149,6 +149,6 @@ class Assist(Check):
         return front, min(max(request.rear - turn, -most), most)
 
     def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
-        """Show that the motion is turned; it limits nothing."""
+        """Report that the motion is turned, without a speed limit."""
         if courses and self._turned:
             yield PaceLimit(Reason.ASSISTED, self.view.motion.max_pace(courses[0][0]))

@@ -63,7 +63,7 @@ class DockArea(NamedTuple):
     without one."""
 
     def outside(self, points: Array) -> NDArray[np.bool_]:
-        """Whether each point (n, 2) in base (m) is no part of the housing."""
+        """Whether each point (n, 2) in base (m) is outside the housing."""
         return np.ones(len(points), np.bool_) if self.housing is None else ~self._within(self.housing, points)
 
     def on_axis(self, points: Array) -> NDArray[np.bool_]:

@@ -202,7 +202,7 @@ class ContactCheck(Check):
             measured_it, near = len(known) >= enough, self.view.confirmed or self.view.dock is not None
             limit = _current_limit(known if measured_it else (self._config.rolling,), self._config.rise)
             load = sign * feedback.current
-            # Elsewhere the robot measures its own first: every motor draws another one.
+            # Elsewhere the robot first measures its rolling current, which differs between motors.
             if load > limit and (measured_it or near):
                 self._touch(ContactFinding("motor current", load, "A", limit), feedback.received)
             else:

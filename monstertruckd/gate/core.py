@@ -541,7 +541,7 @@ class Gate:
         return self._output(now, blocks, limits)
 
     def _by_hand(self, holder: Source | None) -> bool:
-        """Whether an operator drives, and no wizard, which measures what it asks for."""
+        """Whether an operator drives, as opposed to a calibration wizard."""
         if holder is None or holder.inside or self._states.calibrates:
             return False
         return holder.request.role in OPERATORS

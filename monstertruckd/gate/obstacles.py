@@ -94,7 +94,7 @@ class _Sweep(NamedTuple):
 
 
 class _LidarView:
-    """What one lidar shows.
+    """View of one lidar.
 
     Args:
         points: converts its scans to points in base.
@@ -234,7 +234,7 @@ class ObstacleGuard:
 
         Args:
             twists: motions of the base; the shortest distance of all is returned.
-            dock: points inside its housing do not count, and ground in its corridor counts as seen.
+            dock: points inside its housing are ignored, and ground in its corridor is treated as seen.
         """
         self._follow_limits()
         if self._checked is None or (dock is None) != (self._dock is None):
@@ -481,7 +481,7 @@ def _on_the_spot(x: int, y: int) -> bool:
 
 
 def _is_turn(twist: _Steps, body: Footprint) -> bool:
-    """Whether a motion is a turn on the spot, or about another point beside or under the body that is not ahead."""
+    """Whether a motion is a turn on the spot, or about another point next to or under the body that is not ahead."""
     return _on_the_spot(*twist[:2]) or not (twist[0] < 0 or _is_ahead(twist) or _is_sideways(twist, body))
 
 
@@ -499,7 +499,7 @@ def _is_ahead(twist: _Steps) -> bool:
 def _is_sideways(twist: _Steps, body: Footprint) -> bool:
     """Whether a whole side of the body moves outwards, and as fast as the body moves ahead.
 
-    The centre of rotation then lies neither beside nor under the body.
+    The centre of rotation then lies neither next to nor under the body.
     """
     x, y, turn = twist
     return y != 0 and abs(y + turn * body.offset) >= max(abs(turn) * body.half_length, x)

@@ -105,7 +105,7 @@ class ZoneCheck(Check):
             self._slowest = min((limit for _, limit in near if limit > 0.0), default=math.inf)
 
     def _lost(self, now: int) -> str:
-        """Why the pose in map does not count; empty if it does."""
+        """Why the pose in map is not usable; empty if it is."""
         if self._odometry is None or now - self._odometry.stamp > OLDEST * SECOND:
             return "no fresh pose in the map, so zones cannot be checked"
         why = placeless(self._slam)

@@ -180,7 +180,7 @@ def _writer(field: RosField) -> Write:
 
 
 def _write_float32(body: bytearray, value: float) -> None:
-    """What is beyond the range of 32 bits becomes infinite, as numpy makes it in arrays."""
+    """Values beyond the range of 32 bits become infinite, as numpy makes it in arrays."""
     _pad(body, _FLOAT32.size)
     try:
         body += _FLOAT32.pack(value)

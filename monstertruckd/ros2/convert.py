@@ -52,7 +52,7 @@ class RosNames:
     """How stamps and frames are written."""
 
     offset: int = 0
-    """Real time minus the robot's, ns."""
+    """Real time minus robot time, ns."""
     frame: Callable[[str], str] = _own_name
     """Name of a frame of the robot."""
 

@@ -21,7 +21,7 @@ WHEELS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class RobotFacts:
-    """What a face knows of the robot's configuration."""
+    """Data of the robot's configuration that the ROS 2 node needs."""
 
     length: float
     """m."""
@@ -29,7 +29,7 @@ class RobotFacts:
     """m."""
     lens: LensConfig | None = None
     description: str | None = None
-    """URDF with the robot's own names of frames; None = its body has none."""
+    """URDF with the robot's own names of frames; None: its body has none."""
     joints: "WheelJoints | None" = None
     localised: bool = True
     """Whether the robot finds its place by itself; False where it takes map to odom from ROS 2."""
@@ -50,7 +50,7 @@ class WheelJoints:
     """Turns of the motor for one of the wheels."""
 
     def angles(self, steering: SteeringFeedback | None, drive: DriveFeedback) -> Mapping[str, float]:
-        """Steering angle and rotation, rad, by joint of the description; all wheels are shown to turn alike."""
+        """Steering angle and rotation, rad, by joint of the description; all wheels are shown at the same angle."""
         found = {f"{wheel}_spin": drive.position / self.ratio for wheel in WHEELS}
         if steering is None or not self.chassis.steered:
             return found

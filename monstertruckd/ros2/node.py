@@ -27,7 +27,7 @@ class RosArrival:
 
     message: RosMessage
     sender: RosSender | None
-    """None = the graph knows no publisher of this topic that could have sent it."""
+    """None: the graph knows no publisher of this topic that could have sent it."""
     publisher: bytes
     """Identity of the publisher."""
     sequence: int

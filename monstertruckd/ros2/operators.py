@@ -135,7 +135,7 @@ class Operators:
 
     Args:
         connect: makes the client of a source.
-        owner: owner of this side's certificate; None = without.
+        owner: owner of this side's certificate; None: without.
         clock: time.
         report: gets every refusal: node and text.
     """

@@ -29,7 +29,7 @@ def plain_value(value: RosMessage) -> Any:
     """The value of a ``rcl_interfaces/msg/ParameterValue``.
 
     Raises:
-        InputError: it is no plain one.
+        InputError: it is not a plain value.
     """
     name = FIELDS.get(value["type"])
     if name is None:

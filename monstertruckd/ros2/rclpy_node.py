@@ -116,7 +116,7 @@ class RclpyNode:
 
     @property
     def _node(self) -> Any:
-        """The first participant's."""
+        """Identity of the first participant."""
         return self._participants[0].node
 
     def _join(self, number: int = 1) -> "Participant":

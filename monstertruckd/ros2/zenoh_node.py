@@ -44,7 +44,7 @@ def session_settings(connect: str | None, listen: str) -> dict[str, Any]:
     """Configuration of the node's Zenoh session.
 
     Args:
-        connect: endpoint of a running Zenoh router such as ``rmw_zenohd``; None = the node is the router itself.
+        connect: endpoint of a running Zenoh router such as ``rmw_zenohd``; None: the node is the router itself.
         listen: endpoint of that router.
     """
     settings: dict[str, Any] = {

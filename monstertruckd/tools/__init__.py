@@ -1,1 +1,1 @@
-"""What is not the daemon: one room for each job, and `cli`, whose commands open them."""
+"""Tools outside the daemon: one package for each job, and `cli`, whose commands open them."""

@@ -53,7 +53,7 @@ class Gyro:
         self._known = 0
         """When the bias was last known, ns."""
         self.bias: float | None = None
-        """rad/s; None = the robot has not stood long enough."""
+        """rad/s; None: the robot has not stood long enough."""
         self.trusted = True
         """Whether it agrees with the wheels."""
         self.difference = 0.0

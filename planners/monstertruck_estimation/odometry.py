@@ -368,7 +368,7 @@ class OdometryService:
         steering: servo feedback, of a body that steers.
         compass: headings, if there is a compass.
         odometry: ``state/odometry``.
-        pose: ``state/pose``; None = published by localisation.
+        pose: ``state/pose``; None: published by localisation.
         imu: measurements of an inertial measurement unit, if there is one.
         encoders: encoders of wheels that are not driven, if the estimator takes them.
         events: about rejected headings.

@@ -99,7 +99,7 @@ class ScanAngles:
         return self._feedback is not None
 
     def at(self, scan: LaserScan) -> tuple[float, float, float, float] | None:
-        """Roll and pitch of the body, pitch and roll of the joints in the middle of ``scan``, rad; None = unknown."""
+        """Roll and pitch of the body, pitch and roll of the joints in the middle of ``scan``, rad; None: unknown."""
         for odometry in () if self._odometry is None else self._odometry.drain():
             self._moved.observe(odometry)
         self._body.extend((a.stamp, self._moved.tilt(a)) for a in self._compass.drain() if a.tilt_valid)

@@ -86,7 +86,7 @@ class Chassis(ABC):
         drivetrain: motor to wheel, the same for every shaft.
         shafts: names of the driven shafts, in the order of their devices.
         freedom: which axle angles of the bicycle it can take.
-        linkage: servos to axle angles; None = no steered axles.
+        linkage: servos to axle angles; None: no steered axles.
     """
 
     bicycle: FourWheelSteering
@@ -655,8 +655,8 @@ def skid_steer_chassis(
 
     Args:
         size: the robot's.
-        icr_left: lateral position of the left side's ICR, m; None = half the track.
-        icr_right: of the right side's, m; None = minus half the track.
+        icr_left: lateral position of the left side's ICR, m; None: half the track.
+        icr_right: of the right side's, m; None: minus half the track.
         icr_x: longitudinal position of both, m, 0 to -wheelbase.
         gain_left: effective over nominal radius of the left wheels.
         gain_right: of the right wheels.

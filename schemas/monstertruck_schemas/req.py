@@ -286,7 +286,7 @@ class ExploreRequest(Request):
     budget: Annotated[float, Field(gt=0)] | None = None
     """Time budget (s); None for the configured value."""
     find: Annotated[int, Field(ge=1, le=10_000)] | None = None
-    """Look for tags on walls, and end when the map has so many of them; None = explore only."""
+    """Look for tags on walls, and end when the map has so many of them; None: explore only."""
     own: bool = False
     """Whether a stop applies only to an exploration that the same program started."""
 

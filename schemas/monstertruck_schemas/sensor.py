@@ -205,7 +205,7 @@ class SonarRanges(Message):
     """Whether it depends on an expired calibration."""
 
     def echo(self, name: str) -> SonarEcho | None:
-        """The sonar of that name; None = the array has none."""
+        """The sonar of that name; None: the array has none."""
         return next((sonar for sonar in self.sonars if sonar.name == name), None)
 
 
@@ -309,9 +309,9 @@ class StabiliserFeedback(Message):
     """
 
     pitch: float | None = None
-    """Joint angle about y, rad, REP 103: nose DOWN positive; None = unknown."""
+    """Joint angle about y, rad, REP 103: nose DOWN positive; None: unknown."""
     roll: float | None = None
-    """Joint angle about x of the pitched part, rad, REP 103: right side down positive; None = unknown."""
+    """Joint angle about x of the pitched part, rad, REP 103: right side down positive; None: unknown."""
     pitch_joint: StabiliserJoint
     roll_joint: StabiliserJoint
 

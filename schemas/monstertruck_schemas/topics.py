@@ -105,7 +105,7 @@ class Topic(Generic[M]):
     writer: Writer
     doc: str
     rate: float | None = None
-    """Nominal rate in Hz; None = on change."""
+    """Nominal rate in Hz; None: on change."""
     stale_after: float | None = None
     """Age after which the latest message is stale, s, for every reader in the robot. Requests are limited by their
     lease and commands by ``command_timeout`` of the drivers: their limits here are for display only."""

@@ -28,7 +28,7 @@ class Times:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """State of the computer at one instant; None = not available."""
+    """State of the computer at one instant; None: not available."""
 
     load: float
     cores: int

@@ -39,7 +39,7 @@ def transfer(bus: int, address: int, data: bytes, count: int = 0) -> bytes:
     Args:
         bus: file descriptor of the bus.
         address: 7-bit address.
-        data: bytes to write; empty = only read.
+        data: bytes to write; empty: only read.
         count: bytes to read; 0 = only write.
 
     Raises:

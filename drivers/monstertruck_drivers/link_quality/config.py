@@ -15,7 +15,7 @@ class LinkQualityConfig(Schema):
 
     kind: Literal["link_quality"] = "link_quality"
     interface: Annotated[str, Field(pattern=r"^[^/\s]{1,15}$")] | None = None
-    """Name of the interface; None = the connected Wi-Fi, else the connected cable"""
+    """Name of the interface; None: the connected Wi-Fi, else the connected cable"""
     rate: Annotated[float, Field(gt=0, le=10)] = 1.0
     """Checks per second"""
     smoothing: Annotated[float, Field(ge=0, le=60)] = 4.0

@@ -37,7 +37,7 @@ class LinkJudge:
         """Smoothed, dBm; None while nothing is known of it."""
 
     def update(self, time_ns: int, sample: Sample | None) -> LinkLevel:
-        """Process one sample; None = the interface is missing."""
+        """Process one sample; None: the interface is missing."""
         if sample is None or not sample.connected:
             self._forget()
             return LinkLevel.DOWN

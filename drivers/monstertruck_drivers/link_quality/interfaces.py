@@ -18,9 +18,9 @@ class Signal:
     """One row of /proc/net/wireless."""
 
     level: float | None
-    """Signal level (dBm); None = not connected."""
+    """Signal level (dBm); None: not connected."""
     noise: float | None
-    """dBm; None = unknown."""
+    """dBm; None: unknown."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -67,7 +67,7 @@ class BatteryInputConfig(PackConfig):
     offset: float = 0.0
     """Volts added after the gain."""
     current: CurrentInputConfig | None = None
-    """Sensor of the current into the pack, which shows charging; null = none"""
+    """Sensor of the current into the pack, which shows charging; null: none"""
 
     @model_validator(mode="after")
     def _ends_of_scale_are_faults(self) -> Self:

@@ -105,7 +105,7 @@ class Encoder:
     """Builds commands.
 
     Args:
-        device: device number for the Pololu form; None = compact form.
+        device: device number for the Pololu form; None: compact form.
         crc: append the CRC-7 byte.
     """
 

@@ -147,7 +147,7 @@ async def identify(link: Link, clock: Clock, settings: MaestroConfig | MaestroEs
         servo (0 = off), and the voltage at the pin if it is an input.
 
     Raises:
-        DeviceTimeoutError: silence; the text says what to check.
+        DeviceTimeoutError: silence; the text names what to check.
         WrongDeviceError: another device.
     """
     session = MaestroSession(link, clock, Encoder(), timeout=0.3)

@@ -13,10 +13,10 @@ class MjpegConfig(Schema):
 
     kind: Literal["mjpeg"] = "mjpeg"
     http: Annotated[str, Field(pattern=r"^/[!-~]*$")] | None = None
-    """Path on the HTTP server at the port, such as /stream: multipart or single pictures; null = the port sends
+    """Path on the HTTP server at the port, such as /stream: multipart or single pictures; null: the port sends
     pictures without HTTP"""
     poll: Annotated[float, Field(gt=0, le=30)] | None = None
-    """Pictures to fetch a second, where ``http`` gives a single one; null = it gives a stream"""
+    """Pictures to fetch a second, where ``http`` gives a single one; null: it streams"""
     width: Annotated[int, Field(ge=16, le=4096)] = 640
     """Width that the camera is set to, pixels; others are reported"""
     height: Annotated[int, Field(ge=16, le=4096)] = 480
@@ -24,7 +24,7 @@ class MjpegConfig(Schema):
     rate: Annotated[float, Field(gt=0, le=120)] = 15.0
     """Pictures a second that the camera is set to"""
     delay: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Time from exposure to arrival (s): the pictures carry no times of their own"""
+    """Time from exposure to arrival (s): the images contain no time stamps"""
     most: Annotated[int, Field(ge=10_000, le=10_000_000)] = 2_000_000
     """Maximum length of a picture (bytes)"""
     watchdog: Annotated[float, Field(gt=0, le=60)] = 5.0

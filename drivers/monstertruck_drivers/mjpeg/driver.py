@@ -13,7 +13,7 @@ class MjpegDriver(WebcamDriver):
     """Publishes every whole picture, stamped with its arrival minus the configured delay.
 
     Args:
-        config: what comes, from where.
+        config: settings of the camera.
         port: program, TCP port or emulated camera.
         clock: time.
         out: pictures.

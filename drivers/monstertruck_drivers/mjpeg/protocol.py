@@ -91,7 +91,7 @@ class HttpHead:
     """Content type, in lower case, without parameters."""
     chunked: bool
     length: int | None
-    """Bytes of the content; None = not given."""
+    """Bytes of the content; None: not given."""
 
     @classmethod
     def of(cls, head: bytes) -> "HttpHead":

@@ -32,7 +32,7 @@ class LinkSource:
     """Camera behind a port.
 
     Args:
-        config: what comes from it.
+        config: settings of the camera.
         port: program, TCP port or emulated camera.
         clock: time.
     """
@@ -176,7 +176,7 @@ class _Pictures(ABC):
 
 
 class _Streamed(_Pictures):
-    """Pictures one after the other."""
+    """Images in sequence."""
 
     async def _take(self) -> CameraFrame:
         if self._connection is None:

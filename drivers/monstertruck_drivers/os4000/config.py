@@ -21,7 +21,7 @@ class IronConfig(Schema):
     hard_x: float = 0.0
     """Microtesla, in the unit's own scale"""
     hard_y: float = 0.0
-    """Along y, likewise"""
+    """Hard iron along y (microtesla), in the unit's own scale"""
     soft_xx: Positive = 1.0
     """Element (x, x) of ``soft``"""
     soft_xy: float = 0.0
@@ -53,7 +53,7 @@ class Os4000Config(Schema):
     silence: Positive = 0.5
     """Seconds without a correct sentence that end the session; never less than five periods."""
     field_strength: Positive | None = None
-    """Magnitude of the magnetic field at the place of calibration (microtesla); None = not checked."""
+    """Magnitude of the magnetic field at the place of calibration (microtesla); None: not checked."""
     field_tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.25
     """Tolerance of the field (fraction); beyond it, the heading is marked as disturbed."""
     iron: IronConfig = IronConfig()

@@ -108,7 +108,7 @@ class Os4000Emulator(FaultyDevice):
         self.received = ReceivedBytes()
         """Bytes the host sent, for tests."""
         self.host_baud: int | None = None
-        """Rate the host uses; None = the same as the unit."""
+        """Rate the host uses; None: the same as the unit."""
         self._clock = clock
         self._source = source
         self._rng = np.random.default_rng(seed)

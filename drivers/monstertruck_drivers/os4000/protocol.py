@@ -113,7 +113,7 @@ def parse(line: bytes) -> Sentence:
     """Read one sentence, with or without its line end.
 
     Raises:
-        ValueError: no sentence, wrong sum, unknown or repeated tag; the text says which.
+        ValueError: no sentence, wrong sum, unknown or repeated tag; the text names the error.
     """
     frame = _FRAME.fullmatch(line)
     if frame is None:

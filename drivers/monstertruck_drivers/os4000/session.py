@@ -122,7 +122,7 @@ def observed_fields(heard: list[tuple[int, Sentence]]) -> Fields:
 
 
 def observed_rate(heard: list[tuple[int, Sentence]]) -> float | None:
-    """Return sentences per second from the median interval, robust to a lost sentence or a burst; None = too few."""
+    """Return sentences per second from the median interval, robust to a lost sentence or a burst; None: too few."""
     times = [time for time, _ in heard]
     intervals = sorted(after - before for before, after in pairwise(times))
     if len(intervals) < 2 or intervals[len(intervals) // 2] == 0:

@@ -35,7 +35,7 @@ class Pca9685Config(Schema):
     """7-bit address, by the solder bridges of the board"""
     front: Pca9685Servo = Pca9685Servo()
     rear: Pca9685Servo | None = None
-    """Servo of the rear axle; null = it does not steer"""
+    """Servo of the rear axle; null: it does not steer"""
     frequency: Annotated[float, Field(ge=40, le=330)] = 50.0
     """Pulses a second; analog servos and most speed controllers take 50. The resolution of a pulse is 1/4096 of the
     cycle"""

@@ -52,7 +52,7 @@ class Pca9685Emulator(FaultyDevice):
 
     Args:
         clock: time.
-        servos: physics of the servos; None = the pulses move nothing.
+        servos: physics of the servos; None: the pulses move nothing.
         address: address by its pins.
         oscillator: frequency of its oscillator (Hz).
         seed: seed of false signals.
@@ -133,7 +133,7 @@ class Pca9685Emulator(FaultyDevice):
     # The bus
 
     def transfer(self, address: int, data: bytes, count: int) -> bytes | None:
-        """Answer one transfer; None = not acknowledged."""
+        """Answer one transfer; None: not acknowledged."""
         if self.faults["absent"] or not self._powered:
             return None
         if address == GENERAL_CALL:

@@ -95,7 +95,7 @@ def register_of(channel: int) -> int:
 
 
 def pulse(channel: int, counts: int) -> bytes:
-    """PwmRegister and values of a pulse from the start of the cycle; 0 counts are no pulse.
+    """PwmRegister and values of a pulse from the start of the cycle; 0 counts mean no pulse.
 
     Raises:
         ValueError: longer than a cycle.

@@ -22,9 +22,9 @@ class ReceiverConfig(Schema):
     drive: Channel | None = None
     """Switch for manual driving; off: planners may drive, the operator only supervises; null: always manual"""
     estop: Channel | None = None
-    """Emergency stop switch; null = none"""
+    """Emergency stop switch; null: none"""
     unseen: Channel | None = None
-    """Switch that permits driving into unseen ground; null = none"""
+    """Switch that permits driving into unseen ground; null: none"""
     inverted: Annotated[tuple[Channel, ...], Field(strict=False)] = (1,)
     """Channels with reversed sign; otherwise up is ahead and left is on. Transmitters send higher values for right"""
     dead_band: Annotated[float, Field(ge=0, le=0.3)] = 0.05

@@ -74,7 +74,7 @@ class RplidarEmulator(FaultyDevice):
         self.received = ReceivedBytes()
         """Bytes the host sent, for tests."""
         self.mode: ScanMode | None = None
-        """Current scan mode; None = idle."""
+        """Current scan mode; None: idle."""
         rng = np.random.default_rng(seed)
         self.signals = Signals(clock.now, {RANGE: SignalKind.ARRAY, SCAN: SignalKind.SWITCH}, rng, codes={RANGE: 1})
         self.head = TurningHead(clock, source, model.ranges, model.frequency, rng)

@@ -96,7 +96,7 @@ class Srf08Driver:
         return {name: await self._echo(session, name, at, sent) for name, at in fired.items()}
 
     async def _fire(self, session: Srf08Session, name: str) -> int | None:
-        """Time of the ping; None = the sonar does not take the command."""
+        """Time of the ping; None: the sonar does not take the command."""
         address = self._config.sonars[name].address
         if name not in self._set_up:
             for register, value in ((Srf08Register.GAIN, self._config.gain), (Srf08Register.RANGE, self._setting)):

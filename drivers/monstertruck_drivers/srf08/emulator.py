@@ -193,7 +193,7 @@ class Srf08Emulator(FaultyDevice):
 
 
 def _size(buffer: bytes) -> int | None:
-    """Return the length of the command at the start of ``buffer``; None = not yet known."""
+    """Return the length of the command at the start of ``buffer``; None: not yet known."""
     if not buffer:
         return None
     if buffer[0] == ISS:

@@ -198,7 +198,7 @@ class StepperEmulator(FaultyDevice):
         self._turn(None if state is MotorState.OFF else self._ordered, self._quick)
 
     def _turn(self, rates: list[float] | None, acceleration: float) -> None:
-        """Make the steps of rates, steps/s; None = no current."""
+        """Make the steps of rates, steps/s; None: no current."""
         self._asked = rates
         rates = self._disobeyed(rates)
         self._powered, self._ramp = rates is not None, acceleration * self._rpm

@@ -76,7 +76,7 @@ class PowerConfig(Schema):
     method: CycleMethod | None = None
     """Method to switch ports; None disables switching"""
     after: Annotated[int, Field(ge=1, le=100)] | None = None
-    """Number of consecutive short sessions before a port is cycled automatically; None = only on request"""
+    """Number of consecutive short sessions before a port is cycled automatically; None: only on request"""
     off_time: Annotated[float, Field(ge=0.1, le=30)] = 2.0
     """Time without power (s)"""
     cut: Annotated[tuple[str, ...], Field(strict=False)] = ()

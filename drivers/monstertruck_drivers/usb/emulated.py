@@ -117,7 +117,7 @@ class EmulatedUsb:
             name: place, e.g. ``1-1.2``; its hub must exist.
             usb_id: ``vendor:product``.
             title: product.
-            node: ``ttyUSB`` (FTDI), ``ttyACM`` (CDC) or ``video``; None = no node.
+            node: ``ttyUSB`` (FTDI), ``ttyACM`` (CDC) or ``video``; None: no node.
             interface: USB interface of the node.
             serial: serial number.
             cable: emulated port behind a serial node.

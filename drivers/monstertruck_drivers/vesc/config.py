@@ -18,7 +18,7 @@ class VescMotorConfig(Schema):
     """One controller: the one that is connected, or one behind it on its CAN bus."""
 
     can_id: Annotated[int, Field(ge=0, le=254)] | None = None
-    """Its CAN id; null = the connected one"""
+    """Its CAN id; null: the connected one"""
     inverted: bool = False
     """Driving forward takes negative speeds"""
 
@@ -89,7 +89,7 @@ class VescConfig(Schema):
     standstill_rpm: Annotated[float, Field(gt=0, le=10_000)] = 60.0
     """Slower than this counts as at rest"""
     servo: VescServoConfig | None = None
-    """Servo output, which steers the front axle; null = another device steers, or nothing does"""
+    """Servo output, which steers the front axle; null: another device steers, or nothing does"""
     battery: PackConfig | None = None
     """Pack that supplies the first controller, measured by that controller; null if another device measures it"""
     battery_rate: Annotated[float, Field(gt=0, le=50)] = 10.0

@@ -186,7 +186,7 @@ class VescEmulator(FaultyDevice):
     Args:
         clock: time.
         plants: loads of the motors; free motors take the missing places.
-        servos: steering servos; the output moves the servo on channel 0. None = not connected.
+        servos: steering servos; the output moves the servo on channel 0. None: not connected.
         settings: list of controllers.
         own_id: CAN id of the connected controller.
     """
@@ -211,7 +211,7 @@ class VescEmulator(FaultyDevice):
         kinds["servo"] = SignalKind.ORDER
         self.signals = Signals(clock.now, kinds, np.random.default_rng(0))
         self.position: float | None = None
-        """Position of the servo output; None = no pulses yet."""
+        """Position of the servo output; None: no pulses yet."""
         self._clock = clock
         self._servos = servos
         self._late = LateAnswers()

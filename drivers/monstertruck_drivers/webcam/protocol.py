@@ -91,7 +91,7 @@ class Filled:
     """Bytes of the picture."""
     flags: int
     stamp: int | None
-    """Nanoseconds of CLOCK_MONOTONIC; None = of another clock."""
+    """Nanoseconds of CLOCK_MONOTONIC; None: of another clock."""
     sequence: int
     offset: int
     """Offset for mapping the buffer."""

@@ -32,7 +32,7 @@ class CameraFrame:
     """One picture as the camera gave it: not checked yet."""
 
     stamp: int | None
-    """Time of exposure on CLOCK_MONOTONIC (ns); None = unknown."""
+    """Time of exposure on CLOCK_MONOTONIC (ns); None: unknown."""
     sequence: int
     """The camera's own count."""
     data: bytes

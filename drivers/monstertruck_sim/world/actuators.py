@@ -15,7 +15,7 @@ class Shaft:
     def __init__(self, config: MotorConfig) -> None:
         self._config = config
         self.target: float | None = None
-        """Speed that it ramps towards, rpm; None = the power stage is off."""
+        """Speed that it ramps towards, rpm; None: the power stage is off."""
         self._acceleration = 0.0
         self.turns = 0.0
         self.rpm = 0.0

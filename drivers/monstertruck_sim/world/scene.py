@@ -267,7 +267,7 @@ class Surroundings:
             ys: (n,) as ``xs``.
             angles: (n,) directions in the map frame, rad.
             reach: m.
-            times_ns: (n,) instants of the rays, rising: the others are met where they were then; None = now.
+            times_ns: (n,) instants of the rays, rising: the others are met where they were then; None: now.
             without: name of the robot that looks.
         """
         others = [body for body in self.bodies if body.name != without]

@@ -89,7 +89,7 @@ class PlaneSweep:
 
     Args:
         cast: ranges to the walls.
-        terrain: the ground; None = level.
+        terrain: the ground; None: level.
         config: configuration of the lidar.
     """
 

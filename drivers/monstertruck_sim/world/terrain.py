@@ -91,7 +91,7 @@ def rocking(config: SinusoidTilt, elapsed_ns: int) -> tuple[float, float]:
 
 
 def profile_path(map_path: Path) -> Path:
-    """Where the ground profile of a map lies, if it has one."""
+    """Path of the ground profile of a map, if it has one."""
     return map_path.with_suffix(".profile.yaml")
 
 

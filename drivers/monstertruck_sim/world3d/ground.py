@@ -136,7 +136,7 @@ def scenery(path: Path) -> tuple[list[ET.Element], list[ET.Element]]:
     reference, element compiler).
 
     Raises:
-        InputError: it is no MJCF file, something in it moves, or it has what is not taken over: classes of defaults,
+        InputError: it is not an MJCF file, contains a moving body or unsupported elements: classes of defaults,
             another sequence of Euler angles.
     """
     expected = "MJCF (sim.world.mjcf)"

@@ -126,7 +126,7 @@ class StaticScene:
     Args:
         walls: rectangles of solid map cells, (n, 4): least x, least y, greatest x, greatest y, m.
         wall_height: over the ground, m.
-        heights: heights of the ground; None = level at 0.
+        heights: heights of the ground; None: level at 0.
         blocks: on it.
         scenery: assets, and bodies and geometries, of another MJCF file.
         tags: on the walls.

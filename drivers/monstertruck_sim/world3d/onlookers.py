@@ -38,7 +38,7 @@ class Film:
         file: GIF, written as it is filmed; it takes its name at the end.
 
     Raises:
-        InputError: the engine has nothing to draw, or the file is no GIF.
+        InputError: the engine has nothing to draw, or the file is not a GIF.
         NotInstalledError: this computer has no EGL.
     """
 

@@ -23,7 +23,7 @@ class ExploreCommand(ModelCommand):
     """Command with the settings of an exploration as options."""
 
     def added(self) -> Iterator["inspect.Parameter"]:
-        """Yield what an order to explore may say."""
+        """Yield the options of an order to explore."""
         from monstertruck_schemas.req import ExploreRequest
 
         return field_parameters(ExploreRequest, "home", "budget", "find", switches={"home": "--home/--stay"})

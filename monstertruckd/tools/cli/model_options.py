@@ -70,7 +70,7 @@ class ModelCommand(NumberCommand):
         """Run it.
 
         Raises:
-            InputError: a model refuses what was given.
+            InputError: a model rejects a value.
         """
         from pydantic import ValidationError
 

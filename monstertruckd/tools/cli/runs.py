@@ -102,7 +102,7 @@ async def run_mission(
 
     Args:
         client: client of the robot.
-        mission: None = resume the interrupted one.
+        mission: None: resume the interrupted one.
         arm: arm the robot first.
         moved: see ``TruckClient.mission``.
         report: gets a line for each step, each that failed, and why the robot waits or stands.

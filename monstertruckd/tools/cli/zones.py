@@ -126,7 +126,7 @@ def area_of(corners: list[str], limit: float | None, inside: Literal["stop", "le
     """Polygon of a command line.
 
     Raises:
-        InputError: fewer than three corners, a corner that is no x,y, or an impossible zone.
+        InputError: fewer than three corners, a corner without x,y, or an impossible zone.
     """
     from pydantic import ValidationError
 

@@ -45,7 +45,7 @@ def run_fast_demo(config_file: Path, folder: Path, seed: int | None, film: Path 
     Args:
         config_file: simulated truck's configuration.
         folder: for log, map and outputs.
-        seed: seed of the world; None = the configuration's.
+        seed: seed of the world; None: the configuration's.
         film: GIF of the lap; engine mujoco only.
 
     Raises:
@@ -138,7 +138,7 @@ def run_fast_exploration(config_file: Path, folder: Path, seed: int | None, repo
     Args:
         config_file: configuration of a simulated robot with an explorer.
         folder: for log, map, report and outputs.
-        seed: seed of the world; None = the configuration's.
+        seed: seed of the world; None: the configuration's.
         report: gets the progress.
 
     Raises:

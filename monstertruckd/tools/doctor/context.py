@@ -219,7 +219,7 @@ def inspect(system: Path, program: Program, config_file: Path | None, uid: int, 
     Args:
         system: folder with its files; "/" is the real one.
         program: this one.
-        config_file: named by the user; None = the one the service is started with.
+        config_file: named by the user; None: the one the service is started with.
         uid: user id of the caller.
         clock: time.
     """

@@ -37,7 +37,7 @@ class DrillLeg:
     number: int
     count: int
     faults: tuple[str, ...] = ()
-    """Kinds of faults that are drawn; empty = all that the robot can have."""
+    """Kinds of faults that are drawn; empty: all that the robot can have."""
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -195,7 +195,7 @@ class Drill:
         count: how many faults.
         config: the simulated truck.
         leg: faults of one truck.
-        faults: kinds of faults that are drawn; empty = all that the robot can have.
+        faults: kinds of faults that are drawn; empty: all that the robot can have.
 
     Raises:
         InputError: nothing drives the robot, its tracker has no path, or it cannot have one of the ``faults``.

@@ -164,7 +164,7 @@ class Wanderer(DrivingStation):
         self._twists = tuple(twist for twist in ((0.0, 0.0, 0.5), (0.0, 0.1, 0.0)) if _can(chassis, twist))
         self._until = 0
         self.backwards: bool | None = None
-        """Only backwards or forwards from now on; None = either."""
+        """Only backwards or forwards from now on; None: either."""
 
     def choose(self, *, backwards: bool | None = None) -> None:
         """Choose another motion, and for how long; ``backwards`` as the attribute, for it and those that follow."""

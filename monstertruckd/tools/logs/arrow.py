@@ -126,7 +126,7 @@ def batches(
     Args:
         path: the log.
         selection: which messages.
-        columns: names of the wanted ones; empty = all.
+        columns: names of the wanted ones; empty: all.
         progress: called with the bytes read.
 
     Raises:
@@ -154,7 +154,7 @@ def windows(
     Args:
         path: the log.
         selection: which messages; names the topics.
-        columns: names of the wanted ones by topic; empty = all.
+        columns: names of the wanted ones by topic; empty: all.
         seconds: length of a window, by log time; infinite = one window.
 
     Raises:

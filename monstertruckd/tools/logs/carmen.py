@@ -43,7 +43,7 @@ def read_carmen(path: Path, given: dict[str, Any], topics: tuple[str, ...] = ())
     Args:
         path: text, or text packed by gzip (``.gz``).
         given: geometry, overrides the log.
-        topics: the kind of line to read; empty = the one with the most scans.
+        topics: the kind of line to read; empty: the one with the most scans.
 
     Raises:
         InputError: it is damaged, or all scans have one time.

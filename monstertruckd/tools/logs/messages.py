@@ -43,7 +43,7 @@ class Selection:
     """A choice of a log's messages; by default all of the topics in the table.
 
     Args:
-        topics: names; empty = all.
+        topics: names; empty: all.
         start: seconds after the log's first message.
         end: as ``start``, not included.
 

@@ -123,7 +123,7 @@ class OpenedLog:
             topics: names.
             at: the topic whose messages make the rows; by default the first.
             within: greatest difference of two stamps, s; without a message so near, the row's other cells are empty.
-            columns: names as they are in each topic's table, for those topics that have them; empty = all.
+            columns: names as they are in each topic's table, for those topics that have them; empty: all.
             start: s after the log's first message.
             end: as ``start``.
             library: library of the table.
@@ -259,7 +259,7 @@ def named(topic: str) -> str:
 
 
 def _wanted(names: Sequence[str], columns: Sequence[str]) -> list[str]:
-    """Those columns of a topic that a table needs; empty = all."""
+    """Those columns of a topic that a table needs; empty: all."""
     times = (LOG_TIME, STAMP)
     return [*times, *(name for name in names if name in columns and name not in times)] if columns else []
 

@@ -23,7 +23,7 @@ def info(path: str | Path) -> dict[str, Any]:
 
     Returns:
         ``path``, ``size`` (bytes), ``damage`` (text or None), ``lost`` (messages known to be), ``spans`` (their times,
-        s after the first message; None = to the end), ``messages``, ``start``/``end`` (ns of daemon time or None),
+        s after the first message; None: to the end), ``messages``, ``start``/``end`` (ns of daemon time or None),
         ``duration`` (s), ``topics`` (name to ``messages``, ``rate`` in Hz or None, ``bytes``, ``schema``, ``start``,
         ``end``), ``attachments`` (name to bytes), ``metadata`` (name to text values).
 

@@ -48,7 +48,7 @@ def check_log(
 
     Args:
         log: file to read; of a run in several parts any one stands for all, a black box for its run up to its end.
-        config: another configuration to compute with; None = the log's own.
+        config: another configuration to compute with; None: the log's own.
         tolerance: greatest difference that agrees, in SI units, instead of the ones above.
         progress: called with the bytes of the run read so far.
 

@@ -30,7 +30,7 @@ class CheckedReplay:
     parts: tuple[Path, ...]
     """The files of its run."""
     config: Path | None
-    """The other configuration; None = the log's own."""
+    """The other configuration; None: the log's own."""
     duration: float
     """Duration of the log, s."""
     end: int

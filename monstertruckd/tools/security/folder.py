@@ -115,7 +115,7 @@ class Expiry:
     role: str
     rank: str
     days: int | None
-    """Until it expires; negative = since then; None = its file is not here."""
+    """Until it expires; negative = since then; None: its file is not here."""
 
 
 class Folder:

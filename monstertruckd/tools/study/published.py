@@ -18,7 +18,7 @@ class PublishedCircle:
     radius_deviation: float
     """As printed, %."""
     drift: tuple[float, float] | None
-    """Drift of the centre, m/s; None = only its size is printed."""
+    """Drift of the centre, m/s; None: only its size is printed."""
     drift_speed: float
     """As printed, m/s."""
     intercepts: tuple[float, float] | None

@@ -28,7 +28,7 @@ class FusionService(OdometryService):
         compass: headings and tilt, if there is a compass.
         scans: motion between scans, bounded and counted, if something finds it.
         odometry: ``state/odometry``.
-        pose: ``state/pose``; None = published by localisation.
+        pose: ``state/pose``; None: published by localisation.
         health: ``health/odometry``.
         events: where slip and disturbances are reported.
         imu: measurements of an IMU, if there is one.

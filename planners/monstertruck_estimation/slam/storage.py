@@ -123,7 +123,7 @@ def save(folder: Path, patch: GridPatch, graph: SavedGraph | None, run: str = ""
     Args:
         folder: folder of the map.
         patch: the whole grid.
-        graph: keyframes; None or empty = the grid alone.
+        graph: keyframes; None or empty: the grid alone.
         run: that made the map: what else it has saved here stays. Empty = a run of its own.
 
     Raises:

@@ -48,7 +48,7 @@ class MoveConfig(BehaviourConfig):
     rate: Annotated[float, Field(gt=0, le=50)] = 20.0
     """Steps per second"""
     radius: float | None = None
-    """Radius of the arc, m, centre on the left positive; 0 = on the spot, null = straight"""
+    """Radius of the arc, m, centre on the left positive; 0 = on the spot, null: straight"""
     length: float | None = None
     """Distance, m, backwards negative; null: given by the angle"""
     angle: float | None = None

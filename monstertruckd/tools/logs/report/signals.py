@@ -99,7 +99,7 @@ class Trace:
 
 
 Value = Callable[[Any], float | None]
-"""Converts a decoded message to the number that is plotted, in the figure's unit; None = no sample."""
+"""Converts a decoded message to the number that is plotted, in the figure's unit; None: no sample."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -55,9 +55,9 @@ class DockConfig(Schema):
     turning: Annotated[float, Field(gt=0, le=1.5)] = 1.0
     """Distance beyond the staging pose that a robot needs to turn its rear to the dock (m); `reverse` only"""
     housing: HousingConfig | None = None
-    """Box that the gate lets the robot come near while it docks; null = the lidar sees nothing where the robot docks"""
+    """Box that the gate lets the robot come near while it docks; null: the lidar sees nothing where the robot docks"""
     charging: ChargingConfig | None = ChargingConfig()
-    """Signs of charging; null = docked is done"""
+    """Signs of charging; null: docked is done"""
 
 
 Docks = dict[Name, DockConfig]
