@@ -1,4 +1,4 @@
-"""``goto``, ``track``, ``path``, ``dock``, ``undock``: drive the robot somewhere and follow its progress.
+"""``goto``, ``track``, ``path``, ``explore``, ``dock``, ``undock``: drive the robot somewhere and follow its progress.
 
 ``convert-path``.
 """
@@ -245,4 +245,43 @@ def _dock_or_undock(step: "DockStep | UndockStep", robot: str, endpoint: str, *,
         return await run_mission(client, mission, arm=arm, report=None if json_output else print_words)
 
     end = with_robot(main, robot, endpoint)
+    print_end(end.reason, end.text, end.as_json(), json_output=json_output)
+
+
+class ExploreCommand(ModelCommand):
+    """Command with the settings of an exploration as options."""
+
+    def added(self) -> Iterator["inspect.Parameter"]:
+        """Yield the options of an order to explore."""
+        from monstertruck_schemas.req import ExploreRequest
+
+        return field_parameters(ExploreRequest, "home", "budget", "find", switches={"home": "--home/--stay"})
+
+
+def explore(
+    context: typer.Context,
+    stop: Annotated[bool, typer.Option("--stop", help="End the exploration that runs.")] = False,
+    arm: ArmOption = False,
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
+    json_output: JsonOption = False,
+) -> None:
+    """Explore: drive to the frontiers of the map until no unknown ground is left, then home, and save the map.
+
+    Prints the progress until the end; the exit code is the reason of the end. Ctrl-C stops it.
+    """
+    from monstertruck_schemas.req import ExploreOrder
+    from monstertruckd.tools.cli.runs import run_exploration
+
+    async def main(client: "TruckClient", _: "Clock") -> "RunEnd | None":
+        await require_section(client, "explorer", "does not explore")
+        if stop:
+            await client.explore(ExploreOrder.STOP)
+            return None
+        report = None if json_output else print_words
+        return await run_exploration(client, arm=arm, report=report, **context.obj)
+
+    end = with_robot(main, robot, endpoint)
+    if end is None:
+        return
     print_end(end.reason, end.text, end.as_json(), json_output=json_output)

@@ -12,7 +12,6 @@ from monstertruckd.tools.cli import (
     devices,
     doctor,
     drill,
-    explore,
     goto,
     kinematics,
     live,
@@ -92,7 +91,7 @@ app.command("import-urdf")(description.import_urdf)
 app.command("move", cls=move.MoveCommand)(move.move)
 app.command("get")(settings.get)
 app.command("set", context_settings={"ignore_unknown_options": True})(settings.set_value)
-app.command("explore", cls=explore.ExploreCommand)(explore.explore)
+app.command("explore", cls=goto.ExploreCommand)(goto.explore)
 app.command("plan-server")(robot.plan_server)
 app.command("replay")(replay.replay)
 app.command("emulate")(devices.emulate)
