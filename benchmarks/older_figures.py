@@ -46,17 +46,23 @@ def commits_since(commit: str, measures: Sequence[str]) -> int:
     raise LookupError(f"no commit {commit}")
 
 
-def picture_commit(picture: Path) -> str:
-    """Return the latest commit that changed ``picture``.
+def latest_commit(file: Path) -> str:
+    """Return the latest commit that changed ``file``.
 
     Raises:
         LookupError: no commit did.
     """
-    name = picture.relative_to(ROOT).as_posix()
+    name = file.relative_to(ROOT).as_posix()
     for commit, paths in _history():
         if name in paths:
             return commit
     raise LookupError(f"no commit of {name}")
+
+
+def known(commit: str, name: str) -> str:
+    """Return ``commit``, or the latest one of the figures ``name`` if a rebase has replaced it."""
+    there = any(found.startswith(commit) for found, _ in _history())
+    return commit if there else latest_commit(ROOT / "docs" / "figures" / f"{name}.json")
 
 
 def rows() -> Iterator[tuple[str, str, Sequence[str], str]]:
@@ -67,14 +73,14 @@ def rows() -> Iterator[tuple[str, str, Sequence[str], str]]:
     pictures = ROOT / "docs" / "pictures"
     for pattern, source in json.loads((pictures / "sources.json").read_text(encoding="utf-8")).items():
         for picture in sorted(pictures.glob(pattern)):
-            yield picture.name, picture_commit(picture), source["shows"], source["command"]
+            yield picture.name, latest_commit(picture), source["shows"], source["command"]
 
 
 def main() -> int:
     """Print a line for each row whose paths have changed since its commit."""
     older = {"figures": 0, "pictures": 0}
     for name, commit, paths, command in rows():
-        if changes := commits_since(commit, paths):
+        if changes := commits_since(known(commit, name), paths):
             older["pictures" if "." in name else "figures"] += 1
             print(f"{name}: {changes} commits since {commit[:8]}; run {command}")
     met = not any(older.values())
