@@ -85,10 +85,10 @@ async def test_the_end_of_the_input_ends_the_last_line_and_nothing_else():
 @pytest.mark.parametrize(
     ("line", "answer"),
     [
-        ("help", "name a device first: lidar, drive; `lidar help` lists its commands"),
+        ("help", "start the line with a device: lidar, drive; `lidar help` lists its commands"),
         ("lidar help", "known: spin"),
         ("lidar nonsense", "error: known: spin"),
-        ("nonsense", "error: start the line with a device: drive; `lidar help` lists its commands"),
+        ("nonsense", "error: start the line with a device: lidar, drive; `lidar help` lists its commands"),
     ],
 )
 def test_help_is_no_error(line: str, answer: str):

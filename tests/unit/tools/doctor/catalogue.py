@@ -415,7 +415,14 @@ FAULTS: tuple[Fault, ...] = (
         "ps -eo",
         _on("host"),
     ),
-    Fault("too hot", lambda made: made.host.inject("temperature", "91"), "heat", Reason.HOST_HOT, "fan", _on("host")),
+    Fault(
+        "too hot",
+        lambda made: made.host.inject("temperature", "91"),
+        "heat",
+        Reason.HOST_HOT,
+        "ventilation",
+        _on("host"),
+    ),
     Fault(
         "throttled", lambda made: made.host.inject("cap", "0.5"), "heat", Reason.HOST_THROTTLED, "cpufreq", _on("host")
     ),
@@ -547,7 +554,7 @@ FAULTS: tuple[Fault, ...] = (
     *(
         Fault(f"log: {check}", log(event(reason)), check, reason, mend, _on("log"))
         for check, reason, mend in (
-            ("brown-out", Reason.DEVICE_RESTARTED, "measure it"),
+            ("brown-out", Reason.DEVICE_RESTARTED, "measure the voltage"),
             ("clock steps", Reason.CLOCK_STEPPED, "set the clock before"),
             ("throttled", Reason.HOST_THROTTLED, "measure its supply"),
             ("over-current", Reason.OVER_CURRENT, "use a supplied hub"),

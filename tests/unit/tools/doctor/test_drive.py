@@ -128,7 +128,7 @@ def test_a_corridor_tells_the_turn_and_not_the_way():
         assert moved[2] == pytest.approx(0.05, abs=0.01)
     rows = [replace(move, distance_seen=None) for move in moves()]
     assert not found(rows)
-    assert "not seen" in next(f.seen for f in judged(rows, str) if f.check == "sign motor")
+    assert "not determined" in next(f.seen for f in judged(rows, str) if f.check == "sign motor")
 
 
 async def test_what_the_gate_refuses_is_said_and_other_bodies_are_not_driven():

@@ -29,7 +29,7 @@ def test_the_clock(tmp_path: Path):
         unsynchronized(emulated)
         emulated.process(99, "/usr/sbin/chronyd")
 
-    assert see(tmp_path / "c", calendar, by_chrony)["clock"].seen == "kept by chronyd"
+    assert see(tmp_path / "c", calendar, by_chrony)["clock"].seen == "set by chronyd"
     found = see(tmp_path / "d", calendar, lambda emulated: emulated.clock.step_real(-NOW))["clock"]
     assert (found.level, found.reason, found.fix) == (Level.FAIL, Reason.CLOCK_UNSET, NTP)
 

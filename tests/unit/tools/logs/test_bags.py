@@ -93,7 +93,7 @@ def test_scans_as_json(tmp_path: Path):
     assert log.scans[0].ranges[:-1] == pytest.approx(RANGES[:-1])
     assert math.isnan(log.scans[0].ranges[-1])
     assert "mount" in log.assumed
-    with pytest.raises(InputError, match=r"/other holds thing \(json\): expected foxglove.LaserScan or sensor_msgs"):
+    with pytest.raises(InputError, match=r"/other contains thing \(json\): expected foxglove.LaserScan or sensor_msgs"):
         read_scans(tmp_path / "a.mcap", topics=("/other",))
 
 
