@@ -119,10 +119,7 @@ class SteeringWizard:
         iron = settings.iron if isinstance(settings, Os4000Config) else IronConfig()
         answer = context.fit("dead time and lag", lambda: response(weaving, chassis, iron))
         fit = context.fit("pulse maps", lambda: model.fit(legs, first))
-        turns, _ = model.predict(legs, Maps.from_parameters(fit.parameters))
-        points = np.degrees(np.column_stack((turns, [leg.turn for leg in legs])))
-        same = np.repeat(np.array((points.min(), points.max()))[:, None], 2, axis=1)
-        context.plot(Plot("turns of all legs", "by the pulse maps (deg)", "by the compass (deg)", points, same))
+        context.plot(turns_plot(legs, model, Maps.from_parameters(fit.parameters)))
         result = context.fit("intervals", lambda: self._result(context, model, legs, fit, travel))
         return result.model_copy(update={"estimates": (*result.estimates, *estimates(answer))})
 
@@ -341,6 +338,14 @@ class AxleTravel:
                 key=f"{STEERING}.{name}.{end}",
             )
         return [travel] if limit is None else [travel, limit]
+
+
+def turns_plot(legs: Sequence[SteeringRun], model: SteeringModel, maps: Maps) -> Plot:
+    """Plot the turns of all legs by the compass against those by the pulse maps."""
+    turns, _ = model.predict(legs, maps)
+    points = np.degrees(np.column_stack((turns, [leg.turn for leg in legs])))
+    same = np.repeat(np.array((points.min(), points.max()))[:, None], 2, axis=1)
+    return Plot("turns of all legs", "by the pulse maps (deg)", "by the compass (deg)", points, same)
 
 
 def _steered(axle: int, angle: float) -> tuple[float, float]:

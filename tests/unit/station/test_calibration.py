@@ -100,7 +100,7 @@ async def test_a_wizard_asks_shows_its_result_and_saves_it_once_it_is_accepted()
     assert wizards.saved == 0
     with pytest.raises(InputError, match="not asking a question"):
         run.answer(1.0)
-    with pytest.raises(InputError, match=r"battery\.gain runs already"):
+    with pytest.raises(InputError, match=r"battery\.gain is already running"):
         run.begin("battery.gain", {})
     run.decide(accept=True)
     saved = await state(viewer)

@@ -210,6 +210,9 @@ class Session:
     def say(self, text):
         self.said.append(text)
 
+    def plot(self, plot):
+        self.said.append(plot.name)
+
     async def confirm(self, step):
         return True
 

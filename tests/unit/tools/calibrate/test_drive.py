@@ -77,6 +77,7 @@ class Course:
         self.said: list[str] = []
         self.value = self.values.__getitem__
         self.say = self.said.append
+        self.plot = lambda plot: None
 
     async def confirm(self, step):
         self.asked.append(step.name)

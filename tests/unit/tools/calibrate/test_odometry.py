@@ -80,6 +80,9 @@ class Bent:
     def fit(self, name, function):
         return None
 
+    def plot(self, plot):
+        assert plot.points.shape == (2, 2), "squares"
+
     async def move(self, step):
         record = MoveRecord(left=10, arrived=1000)
         turn = 0.0

@@ -26,7 +26,7 @@ def test_turning_centres_and_wheels():
 
 
 def test_arcs_to_one_side_are_refused():
-    with pytest.raises(InputError, match="to both sides"):
+    with pytest.raises(InputError, match="in both directions"):
         result_of(arcs([(8.0, 12.0)] * 5), 0.021, 0.0525)
 
 

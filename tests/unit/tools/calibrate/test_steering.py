@@ -150,7 +150,11 @@ def test_the_moves_that_are_announced_are_those_that_are_made(wizard: SteeringWi
         return MoveRecord()
 
     def fit(what: str, _: object) -> object:
-        return (1, 1) if what == "directions" else SimpleNamespace(model_copy=lambda update: None, estimates=())
+        return (
+            (1, 1)
+            if what == "directions"
+            else SimpleNamespace(model_copy=lambda update: None, estimates=(), parameters=None)
+        )
 
     def reach(axle: int, sign: int, *_: object) -> SimpleNamespace:
         return SimpleNamespace(axle=axle, sign=sign, servo=0.4)
@@ -161,7 +165,9 @@ def test_the_moves_that_are_announced_are_those_that_are_made(wizard: SteeringWi
     monkeypatch.setattr(SteeringModel, "fit", lambda *_: SimpleNamespace(parameters=None))
     monkeypatch.setattr(steering.AxleTravel, "of", reach)
     monkeypatch.setattr(steering, "estimates", lambda _: ())
+    monkeypatch.setattr(steering, "turns_plot", lambda *_: None)
     context = SimpleNamespace(
+        plot=lambda _: None,
         chassis=CHASSIS, confirm=answer, ask=answer, expect=announced.append, move=move, fit=fit,
         config=SimpleNamespace(gate=SimpleNamespace(angle=0.4), devices=SimpleNamespace(compass=None)),
     )  # fmt: skip
