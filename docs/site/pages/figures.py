@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.older_figures import commits_since
+from benchmarks.older_figures import commits_since, known
 from pages.markdown import Page, join, table
 
 DOCS = Path(__file__).resolve().parents[2]
@@ -75,12 +75,21 @@ def read(file: Path) -> Figures:
     try:
         found = json.loads(file.read_text(encoding="utf-8"))
         return Figures(
-            *(found[key] for key in ("command", "commit", "machine")),
+            found["command"],
+            _known(found["commit"], file.stem),
+            found["machine"],
             tuple(found["measures"]),
             *(found[key] for key in ("figures", "goals", "tables")),
         )
     except (KeyError, ValueError) as error:
         raise ValueError(f"{file.name}: {error!r}") from error
+
+
+def _known(commit: str, name: str) -> str:
+    try:
+        return known(commit, name)
+    except (OSError, LookupError, subprocess.CalledProcessError):
+        return commit  # no clone, or a shallow one
 
 
 def shown(markdown: str) -> str:

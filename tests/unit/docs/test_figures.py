@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.older_figures import latest_commit
 from benchmarks.record import program, record, tables
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -92,24 +93,10 @@ def test_figures_older_than_their_code_are_shown_with_the_number_of_changes(figu
     assert found.source.endswith(f"{found.machine}.")
 
 
-def test_every_commit_of_a_file_is_in_the_history():
-    if (
-        subprocess.run(
-            ["git", "rev-parse", "--is-shallow-repository"], cwd=ROOT, capture_output=True, text=True, check=True
-        ).stdout
-        != "false\n"
-    ):
-        pytest.skip("a shallow clone")
-    commits = {file.stem: json.loads(file.read_text(encoding="utf-8"))["commit"] for file in FILES}
-    there = subprocess.run(
-        ["git", "cat-file", "--batch-check=%(objecttype)"],
-        cwd=ROOT,
-        input="\n".join(commits.values()),
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout.splitlines()
-    assert dict(zip(commits, there, strict=True)) == dict.fromkeys(commits, "commit")
+def test_a_commit_that_a_rebase_replaced_is_the_latest_of_its_file(figures):
+    file = FILES[0]
+    assert figures.read(file).commit == figures.known(json.loads(file.read_text(encoding="utf-8"))["commit"], file.stem)
+    assert figures.known("no such commit", file.stem) == latest_commit(file)
 
 
 def test_the_program_of_a_command_is_its_file():
