@@ -102,6 +102,6 @@ async def test_a_browser_asks_for_the_list_and_chooses_from_it():
         assert (await answer(do="plot", set=1, names=[VOLTAGE]))["ok"]
         refused = await answer(do="plot", set=2, names=["state/gate:mode"])
         assert not refused["ok"]
-        assert refused["text"].startswith("state/gate:mode: expected a number")
+        assert refused["text"].startswith("state/gate:mode: expected a numeric field")
         (viewer,) = station._viewers
         assert (viewer.plotted, viewer.plot_set) == ((VOLTAGE,), 1)

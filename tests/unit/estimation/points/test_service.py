@@ -307,7 +307,7 @@ def test_a_mark_in_a_map_that_is_never_saved_is_refused(tmp_path):
 def test_a_robot_that_is_lost_marks_no_place_of_its_own_and_reads_no_tags(tmp_path):
     async def story(rig: Rig) -> None:
         await rig.drive(1.5)
-        with pytest.raises(RequestRefusedError, match="not known"):
+        with pytest.raises(RequestRefusedError, match="unknown"):
             await rig.ask(PointOrder.MARK, "here")
         await rig.ask(PointOrder.MARK, "there", x=1.0, y=3.0)
         await rig.drive(1.5)

@@ -162,7 +162,7 @@ ROBOT = "{ front: red, rear: blue, apart: 0.1 }"
         ("robots: { a: { tag: 1 } }\nblobs: { a: { front: red, rear: blue, apart: 0.1 } }", "a: expected in robots or"),
         ("robots: { a: { tag: 1 }, b: { tag: 1 } }", "tag 1: expected on one robot"),
         ("robots: { a: { tag: 100 } }", "tag 100: expected on one robot only, and not among the marks"),
-        ("blobs: { a: { front: red, rear: red, apart: 0.1 } }", "front and rear are red"),
+        ("blobs: { a: { front: red, rear: red, apart: 0.1 } }", "front and rear are both red"),
         (f"blobs: {{ a: {ROBOT}, b: {{ front: blue, rear: red, apart: 0.1 }} }}", "blobs.a has the same colours as b"),
     ],
 )

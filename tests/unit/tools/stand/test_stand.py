@@ -299,7 +299,7 @@ def test_the_commands_calibrate_and_track_recorded_pictures(stand, tmp_path):
     assert rows[0]["cameras"] == "c1 c2"
     again = CliRunner().invoke(app, ["stand", "calibrate", "-c", str(file)])
     assert again.exit_code != 0
-    assert "no pictures" in again.output
+    assert "no images" in again.output
 
 
 def test_the_shipped_configuration_is_one():
