@@ -138,6 +138,7 @@ trees = st.builds(
 
 PROTOBUF: dict[t.Topic[Any], st.SearchStrategy[Message]] = {
     t.SCAN: scans,
+    t.SCAN_2: scans,
     t.CAMERA: images,
     t.ODOMETRY: odometries,
     t.POSE: odometries,

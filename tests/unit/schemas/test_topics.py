@@ -111,6 +111,8 @@ def test_reasons_have_stable_exit_codes_and_texts():
         Reason.KEEPOUT: Reason.OBSTACLE_STOP,
         Reason.DOCK_MISSED: Reason.GOAL_MISSED,
         Reason.DOCK_NOT_SEEN: Reason.INPUT_STALE,
+        Reason.LIDAR_TURNED: Reason.TIME_OFFSET,
+        Reason.MAP_CHANGED: Reason.OUTSIDE_MAP,
     }
     failing = [reason.exit_code for reason in Reason if reason.exit_code and reason not in later]
     assert len(failing) == len(set(failing))
