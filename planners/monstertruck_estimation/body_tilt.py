@@ -1,8 +1,9 @@
-"""The body's tilt by its compass, corrected for the body's acceleration.
+"""Body tilt from the compass, corrected for the body's acceleration.
 
-A compass finds the vertical by an accelerometer, which feels the reaction to gravity and to the body's acceleration:
-0.9 m/s^2 look like 5 degrees, and a truck that slows down on seeing a slope would see one because it slows down. The
-odometry's acceleration, by its speed and its speed times its yaw rate, is taken out of each reading.
+A compass finds the vertical with an accelerometer, which measures the reaction to gravity and to the body's
+acceleration. 0.9 m/s^2 look like a tilt of 5 degrees: a truck that brakes for a slope would then see a slope because it
+brakes. The acceleration that the odometry measures (the change of its speed, and its speed times its yaw rate) is
+therefore subtracted from each reading.
 """
 
 import math
@@ -15,35 +16,35 @@ from monstertruck_schemas.sensor import Attitude
 from monstertruck_schemas.state import Odometry
 
 KEPT_ODOMETRY: Final = 64
-"""Readings of the odometry."""
+"""Odometry readings."""
 
 
 class Tilt(NamedTuple):
-    """Roll and pitch of the body, rad, REP 103."""
+    """Roll and pitch of the body (rad, REP 103)."""
 
     roll: float
     pitch: float
 
 
 class BodyAcceleration:
-    """The body's acceleration by its odometry, and its tilt without it.
+    """Estimate the body's acceleration from odometry and remove it from the measured tilt.
 
     Args:
-        felt: seconds over which it is averaged.
+        felt: averaging time of the acceleration (s).
     """
 
-    # 0.06: seconds over which the odometry's acceleration is averaged, as the compass's accelerometer feels it
+    # 0.06: averaging time of the odometry's acceleration, s; the compass's accelerometer averages over as long
     def __init__(self, felt: float = 0.06) -> None:
         self._felt = round(felt * SECOND)
         self._speeds: deque[tuple[int, float, float]] = deque(maxlen=KEPT_ODOMETRY)
 
     def observe(self, odometry: Odometry) -> None:
-        """Take a reading; readings older than the latest are ignored."""
+        """Add a reading; readings older than the latest are ignored."""
         if not self._speeds or odometry.stamp > self._speeds[-1][0]:
             self._speeds.append((odometry.stamp, odometry.twist.vx, odometry.twist.wz))
 
     def at(self, stamp: int) -> tuple[float, float]:
-        """Forward and left, m/s^2, over the time before ``stamp``, ns; 0 where the odometry does not give it."""
+        """Return the mean acceleration forward and left (m/s^2) before ``stamp`` (ns); 0 where odometry is missing."""
         spell = [speed for speed in self._speeds if stamp - 2 * self._felt <= speed[0] <= stamp]
         old = next((speed for speed in reversed(spell) if speed[0] <= stamp - self._felt), None)
         if old is None or old is spell[-1]:
@@ -54,21 +55,21 @@ class BodyAcceleration:
         return _believed(forward), _believed(left)
 
     def tilt(self, attitude: Attitude) -> Tilt:
-        """Tilt of the body by a valid reading of its compass."""
+        """Return the body's tilt from a valid compass reading."""
         return without(self.at(attitude.stamp), Tilt(attitude.roll, attitude.pitch))
 
 
 def without(acceleration: tuple[float, float], tilt: Tilt) -> Tilt:
-    """Tilt of a body whose accelerometer took the reaction to gravity and to its acceleration for the vertical.
+    """Return the true tilt of an accelerating body from the tilt that its accelerometer measured.
 
     Args:
-        acceleration: forward and left, m/s^2.
-        tilt: measured.
+        acceleration: forward and left (m/s^2).
+        tilt: measured tilt (rad).
     """
     forward, left = acceleration
     return Tilt(tilt.roll - math.atan2(left, GRAVITY), tilt.pitch + math.atan2(forward, GRAVITY))
 
 
 def _believed(acceleration: float) -> float:
-    # 2.0: acceleration of the body that is trusted at most, m/s^2: beyond it the wheels spin, and nothing is taken out
+    # 2.0: maximum plausible acceleration of the body, m/s^2; above it the wheels spin, and no correction is applied
     return acceleration if abs(acceleration) <= 2.0 else 0.0

@@ -1,4 +1,4 @@
-"""The kinds of odometry by ``kind``."""
+"""Odometry kinds by ``kind``."""
 
 from typing import Annotated, Final
 
@@ -27,7 +27,7 @@ ODOMETRY: Final = Catalog(
     ),
     base=OdometrySettings,
 )
-"""An odometry is a function that makes a ``Service`` from its settings and an ``OdometryContext``."""
+"""An odometry kind is a function that builds a ``Service`` from its settings and an ``OdometryContext``."""
 
 AnyOdometry = Annotated[OdometrySettings, ODOMETRY.section("reckoning")]
-"""The configuration's section `odometry`."""
+"""Section `odometry` of the configuration."""

@@ -1,4 +1,4 @@
-"""Odom in map as published, which approaches corrections at a limited rate."""
+"""Published pose of odom in map: it approaches corrections at a limited rate."""
 
 import math
 
@@ -8,13 +8,13 @@ from monstertruck_kinematics.se2 import Pose2, between, compose, inverse
 
 
 class SmoothedCorrection:
-    """Follows corrections at the robot's place, not at the origin of odom: a turn about a far origin would be a jump.
+    """Apply corrections gradually at the robot's place; at the origin of odom, a turn would make a distant robot jump.
 
     Args:
-        slew: greatest speed of the change, m/s and rad/s.
-        jump: corrections of the robot's place beyond this, m, apply at once.
-        settle: time constant of the approach within that, s; 0 for none. Scans are deskewed by these poses: a
-            correction must not look like motion.
+        slew: maximum rate of the change (m/s, rad/s).
+        jump: minimum correction of the robot's place that applies at once (m).
+        settle: time constant of the approach for smaller corrections (s); 0 for none. Scans are deskewed with these
+            poses, so a correction must not look like motion.
     """
 
     def __init__(self, slew: tuple[float, float], jump: float, settle: float = 0.0) -> None:
@@ -26,18 +26,18 @@ class SmoothedCorrection:
 
     @property
     def value(self) -> Pose2:
-        """Odom in map, m and rad."""
+        """Pose of odom in map (m, rad)."""
         x, y, yaw = self._shown.tolist()
         return x, y, yaw
 
     def set_target(self, map_from_odom: Pose2, *, at_once: bool = False) -> None:
-        """Take a new correction; ``at_once``: apply it without a transition."""
+        """Set a new correction; ``at_once`` applies it without a transition."""
         self._target = np.array(map_from_odom)
         if at_once:
             self._shown = self._target.copy()
 
     def pose(self, odom: Pose2, dt: float) -> Pose2:
-        """Base in map for base in odom, ``dt`` seconds after the last call."""
+        """Return the pose of base in map for a pose in odom, ``dt`` seconds after the last call."""
         base = np.array(odom)
         now, then = compose(self._shown, base), compose(self._target, base)
         off = between(now, then)

@@ -1,1 +1,1 @@
-"""Independent measures of the robot's motion, compared with each other: which sensor lies, and by how much."""
+"""Comparison of the robot's independent motion measures, to find the sensor that is wrong and its error."""

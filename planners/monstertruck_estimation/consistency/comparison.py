@@ -42,11 +42,11 @@ class Errors:
     """Maximum errors of a working measure."""
 
     way: tuple[float, float] | None
-    """Distance error: share of the greater distance, and constant (m); None if it does not measure distance."""
+    """Distance error: share of the greater distance, and constant (m); None if the measure gives no distance."""
     turn: tuple[float, float]
     """Turn error: share of the greater turn, and constant (rad)."""
     less: float | None = None
-    """Share of the distance that applies if this measure shows less; None for the same share."""
+    """Share of the distance that applies where this measure shows the smaller one; None for the same share."""
     aside: float = 0.0
     """Sideways error, as a share of the distance."""
     bend: float = 0.0

@@ -1,11 +1,11 @@
 """Lag of the scans' content behind the robot's motion: a likelihood for every lag.
 
-The places by the scans (distance and yaw since the first one) are compared with those by another measure some time
-earlier. The covariance of their difference covers the errors of both: ``Errors`` give the scale, slip that changes
-along the path, each place, a constant bend and drift; the registration gives its deviations; the offset is unknown.
-So only changes of motion tell lags apart, as far as they exceed these errors. A lag is found if the best lag beyond the
-tolerated ones explains the scans so much better than all tolerated ones, and than the longest lag tried, that chance
-cannot: the scans have shown the change, and late.
+The method compares the places by the scans (distance and yaw since the first scan) with the places by another measure
+some time earlier. The covariance of their difference covers the errors of both: ``Errors`` give the scale error, the
+slip along the path, the error of each place, a constant bend and a drift; the registration gives its deviations; the
+offset is unknown. Only changes of motion therefore tell lags apart, as far as they exceed these errors. A lag is found
+if the best lag beyond the tolerated ones explains the scans significantly better than every tolerated lag and better
+than the longest lag tried: the scans have shown the change, but late.
 """
 
 import math
@@ -41,7 +41,7 @@ class ScanStep(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LagQuestion:
-    """Motion by the scans and by other measures, to find the lag; cheap enough for the event loop."""
+    """Motion by the scans and by other measures, for the search of the lag; cheap enough for the event loop."""
 
     tolerated: int
     """Maximum tolerated lag, in ``SHIFT``."""
@@ -66,11 +66,11 @@ def lag_question(steps: list[ScanStep], others: list[tuple[Errors, MotionTrack]]
         others: other measures of the same motion.
         tolerated: maximum tolerated lag (s).
     """
-    lags = SHIFT * np.arange(17)  # only lags shorter than the last one are found
+    lags = SHIFT * np.arange(17)  # the search finds only lags shorter than the last one
     known = []
     for errors, track in others:
         usable = tuple(row for row in steps if track.covers(row.since - int(lags[-1]), row.stamp))
-        if len(usable) >= 12:  # places that are compared, at least
+        if len(usable) >= 12:  # minimum number of compared places
             begins, ends = (np.array([row[end] for row in usable]) - lags[:, None] for end in (0, 1))
             known.append((errors, usable, track.motions(begins, ends)))
     return LagQuestion(int(tolerated * SECOND / SHIFT), tuple(known))
@@ -88,9 +88,9 @@ def scan_delay(question: LagQuestion) -> Delay | None:
     best, allowed = int(np.argmin(cost)), question.tolerated + 1
     if not places or best < allowed:
         return None
-    # Errors that exceed the stated ones everywhere make every difference less certain.
+    # If all differences exceed the stated errors, every difference becomes less certain.
     inflation = max(1.0, float(squares[best]) / places)
-    # A change that the scans have not shown up to the longest lag may never show: the other measure may be wrong.
+    # A change missing in the scans up to the longest lag may never appear: the other measure may be wrong.
     rejected = min(cost[:allowed].min(), cost[-1]) - cost[best]
     sigmas = math.sqrt(float(rejected) / inflation)
     return Delay(best * SHIFT / SECOND, sigmas) if sigmas >= SIGMAS else None
@@ -116,14 +116,14 @@ def _axes(errors: Errors) -> list[_Axis]:
 
 
 def _fit(steps: tuple[ScanStep, ...], moved: Array, axis: _Axis) -> tuple[Array, Array]:
-    """Return, for every lag, (k,), the squared Mahalanobis distance of the places by both, and the log determinant."""
+    """Return each lag's squared Mahalanobis distance between the places, and log determinant, shapes (k,)."""
     shown = np.cumsum([step.moved[axis.place] for step in steps])
     seen = np.square([step.deviations[axis.place] for step in steps])
     seconds = np.array([(step.stamp - steps[0].since) / SECOND for step in steps])
     along = moved[..., 2 * axis.place]
     places, lengths = np.cumsum(along, axis=1), np.cumsum(np.abs(along), axis=1)
     ways = np.cumsum(np.hypot(moved[..., 0], moved[..., 1]), axis=1)
-    slip_length = 0.1  # distance (m) or turn (rad) along which slip stays the same
+    slip_length = 0.1  # distance (m) or turn (rad) over which slip stays constant
     slip = slip_length * np.minimum(lengths[:, :, None], lengths[:, None, :])
     greatest = np.square(axis.share) * (_outer(places) + slip)
     greatest += np.square(axis.bend) * _outer(ways) + np.square(axis.drift) * _outer(seconds[None])

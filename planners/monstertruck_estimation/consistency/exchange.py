@@ -16,16 +16,16 @@ IN_USE: Final = 2 * SECOND
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """Motion claimed by another measure, to be judged by the scans at both of its ends."""
+    """Motion that another measure claims; the scans at both of its ends confirm or refute it."""
 
     since: int
     """Stamp of the earlier scan (ns)."""
     way: tuple[float, float] | None
-    """Place of base at the latest scan in base at the earlier one (m); None to use the scans' own."""
+    """Pose of base at the latest scan relative to the earlier one (m, rad); None to use the scans' own."""
     turn: float
     """Turn (rad)."""
     errors: tuple[float, float]
-    """Maximum difference of the true motion from the claim if the measure works (m, rad)."""
+    """Maximum error of the claim if the measure works (m, rad)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,8 +69,8 @@ class ScanVerdict:
     def refuted(self) -> bool:
         """Whether the scans contradict the claim.
 
-        Where nothing constrains the motion (a corridor, an open field), no point fits only one. Among people who walk,
-        some points fit either, and many fit neither.
+        Without constraints on the motion (a corridor, an open field), every point fits both motions. Among walking
+        people some points fit either motion, and many fit neither.
         """
         outweighed = 4  # required points for the scans' own motion per point that fits only the claim
         return self.own >= max(REFUTING + outweighed * self.claimed, self.misfits)
@@ -102,14 +102,16 @@ class StepOutput:
     motion: Pose2 = (0.0, 0.0, 0.0)
     """Base at ``stamp`` in base at ``since``."""
     deviations: tuple[float, float] = (1.0, 1.0)
-    """Standard deviations of the place ahead (m) and of the yaw (rad) at ``stamp``, against a scan that is kept for
-    some steps: the errors of one step recur in the next one with the opposite sign."""
+    """Standard deviations of the place ahead (m) and of the yaw (rad) at ``stamp``, against a scan several steps old.
+
+    The error of one step recurs in the next with the opposite sign.
+    """
     scatter: tuple[float, float] = (0.0, 0.0)
-    """The same from the differences between the latest motions: no robot moves to and fro from scan to scan."""
+    """The same deviations from the scatter of the latest motions: no robot moves to and fro from scan to scan."""
     overlap: float = 0.0
     """Share of the points that fit the previous scan."""
     verdict: ScanVerdict | None = None
-    """Verdict on the claim; None without a claim, and if the earlier scan is no longer known."""
+    """Verdict on the claim; None without a claim, or if the earlier scan is no longer stored."""
     rest: RestEvidence | None = None
     """Evidence against the claim of standstill; None like ``verdict``."""
     scale: float | None = None

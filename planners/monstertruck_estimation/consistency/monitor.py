@@ -1,10 +1,10 @@
 """Pure core of the consistency check: takes the sensors' readings and finds those that cannot be right.
 
-Motions are compared at every scan, over windows from half a second to some seconds; without a lidar, at every reading
-of the wheels. A difference must last for two comparisons. If the scans take part in it, they must refute the other
-motion: see ``ScanVerdict``. A finding about motion lasts until the robot is armed again, because a standing robot
-shows nothing. A finding about a repeated value ends with the repetition, one about a changed scale when it has changed
-back.
+The monitor compares motions at every scan, over windows from half a second to some seconds; without a lidar, at every
+wheel reading. A difference must last for two comparisons. If one of the compared motions is the scans', they must
+refute the other: see ``ScanVerdict``. A finding about motion lasts until the robot is armed again, because a standing
+robot provides no evidence. A finding about a repeated value ends with the repetition, one about a changed scale when
+the scale has changed back.
 """
 
 import math
@@ -37,9 +37,9 @@ from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.state import Doubt, DoubtKind, StandingBody, UnshownMotion
 
 WINDOWS: Final = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0)
-"""Times over which motions are compared, up to the configured one (s)."""
+"""Windows over which motions are compared, up to the configured one (s)."""
 WITNESSES: Final = (Measure.WHEELS, Measure.GYRO, Measure.ENCODERS, Measure.STAND)
-"""Measures that show when the motion changes."""
+"""Measures that reveal when the motion changes."""
 GAP: Final = SECOND // 2
 """Maximum time between joined headings or rates (ns)."""
 
@@ -69,7 +69,7 @@ class ConsistencyMonitor:
         self._witnesses = [measure for measure in WITNESSES if measure in sensors]
         self._sampled: dict[Measure, int] = {}
         self._seen: tuple[int, Pose2] | None = None
-        """Stamp (ns) and pose as last seen by the stand."""
+        """Stamp (ns) and pose from the latest sample of the stand's cameras."""
         self._heading: tuple[int, float] | None = None
         self._rate: tuple[int, float] | None = None
         self._bias: float | None = None
@@ -77,7 +77,7 @@ class ConsistencyMonitor:
         self._rest_since: int | None = None
         self._scans: deque[int] = deque(maxlen=256)
         """Stamps of scans with known motion."""
-        self._intervals: deque[float] = deque([0.0], maxlen=10)  # only the longest of these is used
+        self._intervals: deque[float] = deque([0.0], maxlen=10)  # the longest of these
         """Intervals between the latest scans (s)."""
         self._steps: deque[ScanStep] = deque()
         self._scatter = 0.0, 0.0
@@ -199,7 +199,7 @@ class ConsistencyMonitor:
         self._note_frozen(sensor, field, stamp, repeats.row, frozen=repeats.frozen)
 
     def observe_whole(self, sensor: str, stamp: int, whole: bytes | None) -> None:
-        """Take a whole scan or image as bytes; None if it has too little content to be compared."""
+        """Add a whole scan or image as bytes; None if it has too little content for a comparison."""
         repeats = self._wholes.setdefault(sensor, WholeRepeats())
         before, self._whole_moved[sensor] = self._whole_moved.get(sensor, stamp), stamp
         if whole is None:
@@ -282,7 +282,7 @@ class ConsistencyMonitor:
         rest = SECOND // 2  # minimum time at rest to measure the bias of a gyroscope, ns
         if stamp - self._rest_since >= rest:
             mean = math.fsum(self._rest) / len(self._rest)
-            self._bias = mean if abs(mean) <= 0.1 else self._bias  # maximum bias: a higher mean rate is none, rad/s
+            self._bias = mean if abs(mean) <= 0.1 else self._bias  # maximum bias, rad/s: a higher mean rate is a turn
             self._rest, self._rest_since = [], None
 
     def _compare(self, stamp: int) -> None:
@@ -368,7 +368,7 @@ class ConsistencyMonitor:
         self._delayed_at = self._steps[-1].stamp
         steps = [step for step in self._steps if step.since >= self._active_since]
         interval, tolerated = max(self._intervals), self._config.delay
-        tolerated += interval if interval > tolerated else 0.0  # stamps of sparse scans are that uncertain
+        tolerated += interval if interval > tolerated else 0.0  # their stamps are as uncertain as that
         others = [(self._errors[measure], self._tracks[measure]) for measure in self._witnesses]
         question = lag_question(steps, others, tolerated)
         return question if question.others else None
@@ -442,7 +442,7 @@ class ConsistencyMonitor:
 
 
 def _claimant(found: dict[Measure, Disagreement]) -> Measure | None:
-    """Return the measure whose motion the scans must judge; None if they are in no difference."""
+    """Return the measure whose motion the scans must judge; None if the scans agree with every measure."""
     for difference in found.values():
         if Measure.SCANS in (difference.one, difference.other):
             return difference.other if difference.one is Measure.SCANS else difference.one

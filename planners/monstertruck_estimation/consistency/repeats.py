@@ -1,4 +1,4 @@
-"""Detect values that repeat to the digit for longer than their noise allows.
+"""Detection of values that repeat exactly for longer than their noise allows.
 
 A sensor whose noise has a standard deviation of at least 0.6 digits gives its most frequent value with a
 probability of at most 0.6 (normal distribution): 40 equal values in a row happen once in 10^9. The detector learns a
@@ -31,7 +31,7 @@ class RepeatDetector:
         """Whether the value has repeated for longer than its noise allows."""
         enough = 0.6  # minimum standard deviation of the noise, in digits, for a value to be judged
         known = self._windows >= 2 and self._noise >= enough * self._digit  # the noise is known after two windows
-        longer = 8  # factor on the longest earlier row: quantisation and filters produce rows, too
+        longer = 8  # factor on the longest earlier row: quantisation and filters also produce rows
         # Minimum number of equal values in a row that such noise does not produce.
         return known and self._row >= max(40, longer * self._longest)
 
@@ -64,7 +64,7 @@ class RepeatDetector:
 class WholeRepeats:
     """Repeat detector for a scan or an image: hundreds of values.
 
-    Two of them are never identical, unless nothing moves and nothing is noisy, as in a simulation.
+    Two of them are never identical, except in a simulation without motion and noise.
     """
 
     def __init__(self) -> None:
@@ -86,13 +86,13 @@ class WholeRepeats:
         if whole != before:
             self._row, self._moved, self.frozen = 1, 0.0, False
             self._different = self._different + 1 if moved == 0.0 and before is not None else 0
-            proof = 10  # different ones in a row at standstill that prove that noise changes each of them
+            proof = 10  # number of different ones in a row at standstill that proves noise in each
             self._noisy |= self._different >= proof
             return
         self._row += 1
         self._different = 0
         self._moved += moved
-        equal = 3  # equal ones in a row that are then no coincidence
+        equal = 3  # number of equal ones in a row that rules out chance
         # Minimum motion (m or rad) that rules out repeats by chance, even without noise.
         self.frozen |= self._row >= equal and (self._noisy or self._moved >= 0.15)
 

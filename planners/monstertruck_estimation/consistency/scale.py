@@ -1,4 +1,4 @@
-"""Detects a change of the lidar's scale between two revolutions: one factor on all ranges.
+"""Detection of a change of the lidar's scale between two revolutions: one factor on all ranges.
 
 Motion of the robot changes every range by a different factor. The points that fit only one of the two explanations
 decide between motion and scale, see ``ScanVerdict``.
@@ -17,7 +17,7 @@ from monstertruck_kinematics.se2 import compose, inverse, transform
 
 
 class Revolution(NamedTuple):
-    """A scan and where it was taken."""
+    """A scan and the sensor's position."""
 
     scan: Scan
     """Scan in base."""
@@ -26,29 +26,29 @@ class Revolution(NamedTuple):
 
 
 class ScaleWatch:
-    """Compares each revolution with the one before.
+    """Compare each revolution with the previous one.
 
-    After a change in the middle of a revolution neither motion nor a factor explains it: the next one is compared with
-    that before it. The last revolution before a change is kept, because a change back may take longer, or happen
-    while the lidar is covered: the ranges have changed back once they fit that revolution again.
+    If the scale changes within a revolution, neither a motion nor a factor explains it; the next revolution is then
+    compared with the one before the change. The last revolution before a change is kept: a change back may take longer
+    or happen while the lidar is covered. The ranges have changed back once they fit that revolution again.
     """
 
     def __init__(self) -> None:
         self._sound: tuple[Cloud, Array] | None = None
         """Last revolution before the scale changed, and the wheels' motion since; None while it is unchanged."""
         self._scale = 1.0
-        """Factor from its ranges to the current ones."""
+        """Factor from that revolution's ranges to the current ones."""
         self._reference: Revolution | None = None
         self._over: list[Array] = []
-        """Motions from the reference to a revolution that nothing explained; empty without one."""
+        """Motions from the reference to an unexplained revolution; empty without one."""
 
     def restart(self, latest: Revolution | None) -> None:
-        """Begin with a lidar that was restarted: its scale is a new one."""
+        """Restart with a lidar that was restarted, whose scale is new."""
         self._sound = None
         self.begin(latest)
 
     def begin(self, latest: Revolution | None) -> None:
-        """Compare from a revolution on, or from the next one."""
+        """Start comparing at a revolution, or at the next one."""
         self._reference, self._over = latest, []
 
     def change(self, latest: Revolution, motions: list[Array]) -> float | None:
@@ -67,7 +67,7 @@ class ScaleWatch:
             self._sound, self._scale = (Cloud.of(earlier.scan), np.zeros(3)), 1.0
         cloud, moved = self._sound
         moved = compose(moved, motions[-1])
-        # 0.5: distance beyond which it shows too little of the same surroundings, m
+        # 0.5: maximum distance at which it still shows the same surroundings, m
         self._sound = None if math.hypot(moved[0], moved[1]) > 0.5 else (cloud, moved)
         if np.count_nonzero(~_fits(latest.scan, cloud, moved)) < REFUTING:
             self._sound = None
@@ -88,7 +88,7 @@ class ScaleWatch:
 
 
 def scale_change(latest: Revolution, earlier: Revolution, motions: list[Array]) -> float | None:
-    """Return the factor from the earlier ranges to the latest ones: 1 if motion explains them, None if nothing does.
+    """Return the factor from earlier to latest ranges: 1 if a motion explains them, None if no factor does.
 
     Args:
         latest: the revolution to judge.
@@ -121,14 +121,15 @@ def _fits(scan: Scan, cloud: Cloud, motion: Array) -> np.ndarray[tuple[int], np.
 
 
 def _factor(latest: Revolution, earlier: Revolution, motions: list[Array]) -> float | None:
-    """Compare points of the same bearing, by the motion under which they agree best on one factor.
+    """Compare points of equal bearing, under the motion for which they agree best on one factor.
 
-    None if too few are compared, or the factor does not stand out of their scatter: the lidar looks at another place.
+    Return None for too few compared points, or if the factor is within their scatter: the lidar then sees another
+    place.
     """
     bearings, distances = _polar(latest.scan.points, latest.origin)
     seen = [_polar(transform(inverse(motion), earlier.scan.points), latest.origin) for motion in motions]
     found = [_ratios(bearings, distances, *earlier_ones) for earlier_ones in seen]
-    if min(map(len, found)) < 30:  # minimum number of points with one of the same bearing
+    if min(map(len, found)) < 30:  # minimum number of points with a partner of equal bearing
         return None
     medians = [float(np.median(ratios)) for ratios in found]
     spreads = [float(np.median(np.abs(ratios - middle))) for ratios, middle in zip(found, medians, strict=True)]
@@ -143,13 +144,13 @@ def _polar(points: Array, origin: tuple[float, float]) -> tuple[Array, Array]:
 
 
 def _ratios(bearings: Array, distances: Array, others: Array, reach: Array) -> Array:
-    """Logarithms of the ratios of distances to the distances of the other points nearest in bearing."""
+    """Return the logarithms of the ratios of the points' distances to those of the nearest bearings."""
     order = np.argsort(others)
     there = np.searchsorted(others[order], bearings)
     sides = [order[(there + side) % len(order)] for side in (-1, 0)]
     apart = [np.abs(np.remainder(others[side] - bearings + math.pi, math.tau) - math.pi) for side in sides]
     nearest = np.where(apart[0] < apart[1], *sides)
-    close = np.minimum(*apart) < math.radians(1)  # of beams that look the same way
+    close = np.minimum(*apart) < math.radians(1)  # of beams with equal bearing
     result: Array = np.log(distances[close] / reach[nearest[close]])
     return result
 

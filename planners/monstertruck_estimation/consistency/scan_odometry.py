@@ -179,8 +179,9 @@ class ScanMotionStep:
     ) -> tuple[Array, float, Fit, float] | None:
         """Return the motion since the previous scan, its overlap, fit and ``spread``; None if no motion fits.
 
-        kiss-icp's pairs of points on walls along the path hold the robot back by up to 0.1 m while it starts moving:
-        its pose is only the start of the registration to the reference, whose pairs slide along surfaces.
+        While the robot starts moving, kiss-icp's pairs of points on walls along the path hold its pose back by up to
+        0.1 m. Its pose is therefore only the initial guess for the registration to the reference, whose pairs slide
+        along surfaces.
         """
         assert self._reference is not None
         cloud, origin = self._reference

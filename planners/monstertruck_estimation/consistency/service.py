@@ -1,4 +1,4 @@
-"""Compare the robot's sensors with each other and publish those that cannot be right."""
+"""Service that compares the robot's sensors with each other and publishes those that must be wrong."""
 
 import asyncio
 import math
@@ -47,7 +47,7 @@ PERIOD: Final = SECOND
 
 @dataclass(frozen=True, slots=True)
 class ConsistencyInputs:
-    """Topics that are compared; None for a sensor that the robot does not have."""
+    """Compared topics; None for a sensor that the robot lacks."""
 
     drives: Sequence[Subscription[DriveFeedback]]
     steering: Subscription[SteeringFeedback] | None
@@ -61,7 +61,7 @@ class ConsistencyInputs:
     scan_2: Mailbox[LaserScan] | None = None
     """Second lidar: whether it repeats a scan; only scans of the first one measure motion."""
     stand: Mailbox[StandPose] | None = None
-    """Cameras over the robot; the ground truth of a simulated world is not a measure."""
+    """Overhead cameras; the ground truth of a simulated world is not a measure."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,25 +69,25 @@ class ScanSetup:
     """Setup for comparing scans."""
 
     actor: Actor
-    """Actor that takes the steps of ``ScanMotionStep``."""
+    """Actor that runs ``ScanMotionStep``."""
     mount: Mount
     """Mount of the lidar."""
     angles: ScanAngles | None
-    """Angles of body and mount at the time of scans; None without a compass."""
+    """Angles of body and mount at the times of scans; None without a compass."""
 
 
 class ConsistencyService:
-    """Feeds a ``ConsistencyMonitor``.
+    """Pass the sensors' messages to a ``ConsistencyMonitor``.
 
     Args:
         config: tolerances.
         chassis: chassis of the robot.
-        clock: time.
-        inputs: sensors.
+        clock: the service's clock.
+        inputs: topics of the sensors.
         scans: scan odometry; None if the robot has no lidar, or it is switched off.
         inertial: axes of the IMU; None if the robot has none.
-        out: ``state/consistency``.
-        events: receives the findings.
+        out: publisher of ``state/consistency``.
+        events: sink of the findings.
     """
 
     name = ServiceName.CONSISTENCY.value
@@ -237,11 +237,11 @@ class ConsistencyService:
     def _work(self, setup: ScanSetup, scan: LaserScan) -> StepInput | None:
         """Return the worker's task for a scan; None if its plane is tilted.
 
-        A single tilted scan ends the measured motion, but no evidence of standing: the jolt of a contact looks like a
-        tilt.
+        A single tilted scan ends the measured motion, but not the evidence of standing: the jolt of a contact looks
+        like a tilt.
         """
         angles = None if setup.angles is None else setup.angles.at(scan)
-        max_tilt = 0.1  # scans whose plane was tilted more than this are left out, rad: they show the ground
+        max_tilt = 0.1  # maximum tilt of the plane of a used scan, rad; beyond it a scan shows the ground
         before, self._tilted = self._tilted, scan.tilt is not None and scan.tilt > max_tilt
         if self._tilted:
             self._anew |= before

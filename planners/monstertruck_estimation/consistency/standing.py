@@ -1,12 +1,12 @@
-"""Detect a body that stands while its wheels roll: likelihood of standing against rolling on, from scan to scan.
+"""Detection of a body that stands while its wheels roll: likelihood ratio of standing and rolling, scan by scan.
 
-The distance by the scans is a function of the distance by the wheels: a broken line. Up to the break both hypotheses
-have the slope of the places before it; after the break the body stands (slope 0), or rolls on with the greatest
-tolerated slip. The difference of both sums of squared residuals, in variances of a place, is twice the logarithm of the
-likelihood ratio. Every place since the wheels' velocity became steady may be the break.
+The distance by the scans is modelled as a function of the distance by the wheels, a broken line. Before the break both
+hypotheses have the same slope, fitted to the places; after the break the body stands (slope 0) or rolls with the
+maximum tolerated slip. The difference of the two sums of squared residuals, in variances of a place, is twice the
+logarithm of the likelihood ratio. Every place since the wheels' velocity became steady may be the break.
 
-The errors of places are taken as independent. Scans may drift as well: wheels so slow that slip and drift together
-could bring the body nearer to standing than to rolling on show nothing.
+The errors of places are assumed independent. Scans may drift as well: if the wheels are so slow that slip and drift
+together could explain a standing body, the test gives no evidence.
 """
 
 import math
@@ -56,7 +56,7 @@ class StandingWatch:
             self._steady_since = stamp
             return None
         if since - self._steady_since < self._delay:
-            return None  # scans that late still show the earlier velocity
+            return None  # scans delayed by that much still show the earlier velocity
         equal = (1.0 + self._slip) / 2  # share of the wheels' motion missing where both hypotheses are equally likely
         if math.hypot(self._slip * speed, self._drift) > equal * speed:
             self._places.clear()
@@ -72,7 +72,7 @@ class StandingWatch:
         # Twice the logarithm of the likelihood ratio of a finding: 4 standard deviations. A false finding moves the
         # robot 3 cm back while an operator watches it.
         likeliest, found = 4.0**2, None
-        least = 3  # places in addition to the coefficients; the stated variance counts as much as so many places show
+        least = 3  # number of places beyond the coefficients; the stated variance has the weight of as many places
         for start in range(len(rolled) - 2):  # at least two places after the break
             before, after = np.minimum(rolled - rolled[start], 0.0), np.maximum(rolled - rolled[start], 0.0)
             columns, places = np.ones((len(rolled), 1)), shown - before

@@ -1,4 +1,4 @@
-"""Motion by one measure, kept for some seconds, between any two instants."""
+"""Motion by one measure between any two instants of the last seconds."""
 
 from bisect import bisect_left
 from math import cos, sin
@@ -12,7 +12,7 @@ from monstertruck_kinematics.se2 import Pose2
 from monstertruck_runtime.clock import SECOND
 
 KEPT: Final = 9 * SECOND
-"""Minimum time that motion is kept (ns); the maximum is half as long again."""
+"""Minimum time for which motion is kept (ns); the maximum is 1.5 times as long."""
 STILL: Final = 0.02, 0.02
 """Maximum speed (m/s) and turn rate (rad/s) of a standing robot."""
 
@@ -36,7 +36,7 @@ class MotionTrack:
         self._stamps, self._poses = [stamp], [(0.0, 0.0, 0.0)]
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Forget all poses."""
         self._stamps, self._poses = [], []
 
     def add(self, stamp: int, motion: Pose2) -> None:

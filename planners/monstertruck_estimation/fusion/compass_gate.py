@@ -10,12 +10,12 @@ from monstertruck_runtime.clock import SECOND
 
 
 class HeadingUse(StrEnum):
-    """Use of a heading."""
+    """Result of the gate for a heading."""
 
     USED = "used"
     LEFT_OUT = "left out"
     ANCHORED = "anchored"
-    """The heading sets north: at the start, or after a long steady deviation."""
+    """The heading sets north: the first one, or one after a long steady deviation."""
     HOME = "home"
     """The heading agrees with an earlier north again."""
 
@@ -26,7 +26,7 @@ class CompassGate:
 
     anchored: bool = False
     disturbed: bool = False
-    """Headings are currently left out."""
+    """Whether headings are currently rejected."""
     good: int = 0
     """Number of good headings in a row while disturbed."""
     good_since: int = 0
@@ -43,17 +43,17 @@ class CompassGate:
     home: tuple[float, float] | None = None
     """North and its variance before the disturbance (rad, rad^2)."""
     field: float = 0.0
-    """Mean field strength at the start, or the one that has replaced it."""
+    """Mean field strength at the start, or its replacement."""
     fields: int = 0
     """Number of readings in that mean."""
     other_field: float = 0.0
-    """Different field strength that currently holds."""
+    """Different field strength that holds at present."""
     other_since: int = 0
     """Start of that field strength (ns)."""
     other_from: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Pose in odom at its start (m, rad)."""
     rejected: int = 0
-    """Number of headings left out since the start."""
+    """Number of headings rejected since the start."""
     jump: float = 0.0
     """Jump of the headings, without a turn of the robot, that began the current disturbance (rad); 0 without one."""
     level: float = 0.0
@@ -79,15 +79,17 @@ class HeadingInnovation:
     local: float
     """Estimated local deviation (rad)."""
     flagged: bool
-    """The device flags the heading as disturbed."""
+    """Whether the device flags the heading as disturbed."""
     taken_back: bool
-    """A disturbance was detected soon after this heading."""
+    """Whether a disturbance was detected soon after this heading."""
     field: float | None
     jump: float | None = None
-    """Jump of the headings at this one (rad); 0 if the robot may have turned. None if unknown: ``turn_known`` then
-    shows whether the residual is a jump."""
+    """Jump of the headings at this one (rad); 0 if a turn of the robot may explain it.
+
+    If None, ``turn_known`` decides whether the residual is a jump.
+    """
     turn_known: float = 0.0
-    """Maximum residual that the robot's own turn may explain, rather than the compass (rad)."""
+    """Maximum residual that a turn of the robot, rather than a compass error, may explain (rad)."""
 
 
 def gate_heading(
@@ -95,22 +97,22 @@ def gate_heading(
 ) -> tuple[HeadingUse, CompassGate]:
     """Return the use of a heading and the next state of the gate.
 
-    A heading is off if its innovation exceeds ``config.gate`` standard deviations (chi-square gating). It is
-    disturbed if the device flags it, if the field strength differs from the one at the start, or if the local
-    deviation has crept further than that. Neither locks the compass out:
+    A heading is off if its innovation exceeds ``config.gate`` standard deviations (chi-square gating). It is disturbed
+    if the device flags it, if the field strength differs from the one at the start, or if the local deviation has crept
+    beyond the gate. Neither excludes the compass for ever:
 
-    - ``config.recover`` good headings over ``config.regain`` let it in again; next to a magnet, too, there is a place
-      where the heading is right.
-    - A heading that is steadily off for ``config.steady_time`` becomes a new north: odometry is the better judge of
-      a turn, and the compass only judges the field around it.
+    - ``config.recover`` good headings over ``config.regain`` readmit it; even next to a magnet there is a place where
+      the heading is right.
+    - A heading that is steadily off for ``config.steady_time`` becomes a new north: odometry measures a turn better,
+      and the compass only judges the field around it.
 
-    A disturbance that began with a jump without a turn of the robot ends when the headings jump back, or as a new
+    A disturbance that began with a jump, without a turn of the robot, ends when the headings jump back or with a new
     north.
     """
     gate, disturbed = _field(gate, innovation, config)
     gate = _jumped(gate, innovation)
     crept = not gate.disturbed and abs(innovation.local) > config.gate * config.local
-    # The first heading is kept: without it there would be no north to return to.
+    # The first heading is always used: without it there is no north to return to.
     if disturbed or crept or (innovation.taken_back and gate.anchored):
         return HeadingUse.LEFT_OUT, _off(gate, innovation, steady=False)
     if not gate.anchored:
@@ -127,14 +129,14 @@ def gate_heading(
 
 
 def _jumped(gate: CompassGate, innovation: HeadingInnovation) -> CompassGate:
-    """Return the gate with a jump that began or ended at this heading.
+    """Return the gate after the start or end of a jump at this heading.
 
-    A jump ends when the headings return by more than half of it over a distance in which reckoning does not.
-    Residuals alone cannot show this: without headings, the yaw soon becomes so uncertain that the robot might as well
-    have caused a lasting jump.
+    A jump ends when the headings return by more than half of it within a distance over which dead reckoning stays
+    accurate. Residuals alone cannot show this: without headings the yaw soon becomes so uncertain that a turn of the
+    robot might explain a lasting jump.
     """
     if innovation.jump is not None:
-        # Where headings were taken back, the previous disturbance may not have ended yet.
+        # If headings were withdrawn, the previous disturbance may not have ended yet.
         jump = gate.jump + innovation.jump
         jump = 0.0 if abs(jump) < abs(innovation.jump) / 2 else jump
         return replace(gate, jump=jump, level=innovation.residual, level_at=innovation.place)
@@ -144,16 +146,16 @@ def _jumped(gate: CompassGate, innovation: HeadingInnovation) -> CompassGate:
     change = wrap_angle(innovation.residual - gate.level)
     if change * gate.jump < 0 and abs(change) > abs(gate.jump) / 2:
         return replace(gate, jump=0.0)
-    # 1.0: distance (m) and turn (rad) over which reckoning drifts less than a jump
+    # 1.0: distance (m) and turn (rad) over which dead reckoning drifts less than a jump
     share = 1.0 - math.exp(-(math.hypot(x - x0, y - y0) + abs(wrap_angle(yaw - yaw0))) / 1.0)
     return replace(gate, level=wrap_angle(gate.level + share * change), level_at=innovation.place)
 
 
 def _field(gate: CompassGate, innovation: HeadingInnovation, config: HeadingTrust) -> tuple[CompassGate, bool]:
-    """Return the gate with the field learned, and whether the reading is disturbed.
+    """Return the gate with the learned field strength, and whether the reading is disturbed.
 
-    A robot may be started near iron: a strength that holds for ``config.steady_time`` and ``config.regain`` metres
-    belongs to the place, and replaces the one from the start.
+    A robot may start near iron: a strength that holds for ``config.steady_time`` and ``config.regain`` metres replaces
+    the one from the start.
     """
     if innovation.flagged:
         return gate, True
@@ -176,7 +178,7 @@ def _field(gate: CompassGate, innovation: HeadingInnovation, config: HeadingTrus
 
 
 def _good(gate: CompassGate, innovation: HeadingInnovation, config: HeadingTrust) -> tuple[CompassGate, bool]:
-    """Return the gate after a good heading while disturbed, and whether enough headings agree."""
+    """Return the gate after a good heading during a disturbance, and whether enough headings agree."""
     if not gate.good or abs(wrap_angle(innovation.residual - gate.good_residual)) > 2 * config.local:
         gate = replace(
             gate,

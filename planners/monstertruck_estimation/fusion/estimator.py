@@ -1,4 +1,4 @@
-"""Fusion of all sensors into one pose: validates and orders measurements, and publishes a pose that never jumps."""
+"""Sensor fusion into one pose: checks and orders measurements, and publishes a pose without jumps."""
 
 import math
 from bisect import bisect_left, bisect_right
@@ -49,8 +49,8 @@ class MeasurementHistory:
     Until all are recomputed, ``newest`` continues from the earlier state with every measurement that is in time.
 
     Args:
-        start: the initial state.
-        advance: applies a measurement.
+        start: initial state.
+        advance: function that applies a measurement.
         horizon: time for which measurements are kept (ns).
     """
 
@@ -62,7 +62,7 @@ class MeasurementHistory:
         self._done = 0
         """Number of leading rows whose states are current."""
         self.newest = start
-        """State after all measurements in time and all recomputed late ones."""
+        """State after all punctual measurements and all late ones recomputed so far."""
 
     @property
     def waiting(self) -> int:
@@ -159,7 +159,7 @@ class Fusion:
     Args:
         config: noise and limits.
         chassis: maps motors and servos to the body's motion; None without wheels.
-        inertial: an IMU, if there is one.
+        inertial: inertial measurement unit; None if the robot lacks one.
     """
 
     def __init__(self, config: FusionConfig, chassis: Chassis | None, inertial: Inertial | None = None) -> None:
@@ -183,12 +183,12 @@ class Fusion:
     # Inputs
 
     def observe_steering(self, feedback: SteeringFeedback) -> None:
-        """Take the servo angles being sent, unless the servo controller marks them untrusted."""
+        """Add the commanded servo angles, unless the servo controller marks them untrusted."""
         if self._wheels is not None:
             self._wheels.observe_steering(feedback)
 
     def observe_drive(self, *shafts: DriveFeedback) -> None:
-        """Take the position of every driven shaft."""
+        """Add the position of every driven shaft."""
         if not shafts or self._wheels is None or self._chassis is None or self._config.wheels is None:
             return
         known, stamp = self._wheels.known, self._wheels.stamp
@@ -212,7 +212,7 @@ class Fusion:
             self._left_out["drive: too late"] += 1
 
     def observe_attitude(self, attitude: Attitude) -> None:
-        """Take heading and tilt."""
+        """Add heading and tilt."""
         values = (attitude.heading, attitude.roll, attitude.pitch)
         if not all(map(math.isfinite, values)):
             self._left_out["compass: not a finite number"] += 1
@@ -245,7 +245,7 @@ class Fusion:
             self._slip.forget_headings()
 
     def observe_scan(self, motion: ScanMotion) -> None:
-        """Take the motion between two scans, some time after the later of them."""
+        """Add the motion between two scans, some time after the later scan."""
         if self._config.scans is None:
             return
         measured = _scan_measurement(motion, self._config.scans.scale)
@@ -387,7 +387,7 @@ class Fusion:
         return self._history is not None and self._history.newest.gate.disturbed
 
     def _look_for_disturbance(self) -> None:
-        """Undo headings shortly before a detected disturbance: a magnet takes effect before it is detected."""
+        """Withdraw the headings shortly before a detected disturbance: a magnet acts before its detection."""
         if self._disturbed and not self._was_disturbed and self._history is not None:
             gate = self._history.newest.gate
             self._jump = gate.jump

@@ -84,7 +84,7 @@ SCAN: Final = slice(8, 11)
 WHEELS: Final = slice(11, 14)
 LOCAL: Final = 14
 LATER: Final = slice(15, 18)
-"""Pose of the scan being applied."""
+"""Pose of the scan in the current update."""
 IDENTITY: Final = np.eye(STATE_SIZE)
 LARGER: Final = np.eye(STATE_SIZE + 3)
 MOVED_BY: Final = ("drive", "lidar")
@@ -256,7 +256,7 @@ def _wheels(state: FilterState, measured: WheelMeasurement, config: FusionConfig
 
 
 def _level(state: FilterState, felt: tuple[float, float] | None) -> tuple[float, float]:
-    """Return the horizontal share of a motion along x and y; the compass has priority over the IMU's tilt ``felt``."""
+    """Return the horizontal part of a motion along x and y; the compass has priority over the IMU's tilt ``felt``."""
     if state.tilt is not None and state.stamp - state.tilt[0] <= TILT_VALID:
         felt = state.tilt[1:]
     if felt is None:

@@ -1,4 +1,4 @@
-"""Publishes the fused odometry."""
+"""Service that publishes the fused odometry."""
 
 from collections.abc import Sequence
 
@@ -18,21 +18,21 @@ from monstertruck_schemas.state import Odometry, ScanMotion
 
 
 class FusionService(OdometryService):
-    """``OdometryService`` that also uses the motion between scans, and reports slip and a disturbed compass.
+    """``OdometryService`` that also uses the motion between scans and reports slip and compass disturbances.
 
     Args:
-        fusion: the filter.
-        clock: time.
+        fusion: the estimator.
+        clock: the service's clock.
         drives: feedback of every driven shaft.
-        steering: servo feedback, of a body that steers.
-        compass: headings and tilt, if there is a compass.
-        scans: motion between scans, bounded and counted, if something finds it.
-        odometry: ``state/odometry``.
+        steering: servo feedback; None for a body without steering.
+        compass: headings and tilt; None without a compass.
+        scans: motion between scans from a bounded, counted queue; None without a scan matcher.
+        odometry: publisher of ``state/odometry``.
         pose: ``state/pose``; None: published by localisation.
-        health: ``health/odometry``.
-        events: where slip and disturbances are reported.
-        imu: measurements of an IMU, if there is one.
-        rate: poses per second.
+        health: publisher of ``health/odometry``.
+        events: sink of slip and disturbance reports.
+        imu: measurements of the IMU; None without one.
+        rate: publishing rate (1/s).
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class FusionService(OdometryService):
         self._published: tuple[int, tuple[bool, bool]] | None = None
 
     def take(self) -> None:
-        """Pass new messages to the filter, and report changes."""
+        """Pass new messages to the estimator and report changes."""
         super().take()
         for motion in self._scans.drain() if self._scans is not None else ():
             self._fusion.observe_scan(motion)
@@ -103,15 +103,15 @@ class FusionService(OdometryService):
         )
 
     def accepts_compass(self) -> bool:
-        """Always: a heading can be the first measurement."""
+        """Return True: a heading can be the first measurement."""
         return True
 
 
 def build_fusion(config: FusionConfig, context: OdometryContext) -> FusionService:
-    """The service with its topics, for the catalog."""
+    """Build the service with its topics, for the catalog."""
     bus, inputs = context.bus, context.inputs()
     imu = context.inertial(config.imu)
-    # 16: motions between scans that may wait
+    # 16: maximum number of queued motions between scans
     return FusionService(
         Fusion(config, context.chassis, None if imu is None else imu.inertial),
         context.clock,

@@ -1,8 +1,8 @@
-"""Wheel slip: compares the wheels' motion with the motion between scans, or their yaw with the compass.
+"""Wheel slip detection: compares the wheels' motion with the motion between scans, or their yaw with the compass.
 
-Scans are evidence against the wheels only while matched without a gap. After a gap, or after an unconstrained
-direction, the matched surfaces may move along with the robot (the ground ahead on a slope), so the scans first have to
-agree with the wheels for a while; scans that do not are rejected themselves.
+Scans are evidence against the wheels only while they are matched without a gap. After a gap, or after an unconstrained
+direction, the matched surfaces may move along with the robot (the ground ahead on a slope). The scans must then agree
+with the wheels for a while first; until they do, the scans are rejected.
 """
 
 import math
@@ -31,24 +31,24 @@ class SlipChange:
 
     slipping: bool
     since: int
-    """Begin of the slip: the wheels are not trusted from then on (ns)."""
+    """Start of the slip (ns); from then on the wheels are not trusted."""
     text: str
     """Description of the disagreement."""
 
 
 class SlipDetector:
-    """Compares wheels with scans or compass, with hysteresis.
+    """Compare wheels with scans or compass, with hysteresis.
 
     Args:
         config: thresholds.
-        deviation: standard deviation of the local deviation of the compass (rad).
+        deviation: standard deviation of the compass's local deviation (rad).
     """
 
     def __init__(self, config: SlipConfig, deviation: float) -> None:
         self._config = config
         self._deviation = deviation
         self._trail: deque[tuple[int, Array, Array]] = deque()
-        """Stamp, pose, and sum of the motions' covariances: the window is too short for their rotation to matter."""
+        """Stamp, pose, and sum of the motions' covariances; their rotation is negligible in so short a window."""
         self._motions: deque[ScanMeasurement] = deque()
         self._headings: deque[tuple[int, float]] = deque()
         self._suspicious = 0
@@ -63,16 +63,15 @@ class SlipDetector:
         """Whether the last scan is rejected."""
 
     def wheels(self, measured: WheelMeasurement) -> SlipChange | None:
-        """Take the motion of the wheels; return the end of a slip that nothing can confirm any longer."""
+        """Add a motion of the wheels; return the end of a slip that no sensor can confirm any longer."""
         if not self._trail or self._trail[-1][0] != measured.since:
             self._trail.clear()
             self._trail.append((measured.since, np.zeros(3), np.zeros((3, 3))))
         _, pose, spread = self._trail[-1]
         self._trail.append((measured.stamp, compose(pose, measured.delta), spread + measured.covariance))
-        while self._trail[0][0] < measured.stamp - 3 * SECOND:  # wheel motion is remembered for this long, ns
+        while self._trail[0][0] < measured.stamp - 3 * SECOND:  # time for which wheel motion is stored, ns
             self._trail.popleft()
-        # Slip that nothing has confirmed for this time (ns) is over: the scans have ended, and only the wheels are
-        # left.
+        # Maximum age of the last confirmation of slip, ns: then the scans have ended, and only the wheels are left.
         expires = 10 * SECOND
         if not self.slipping or measured.stamp - self._compared_at < expires:
             return None
@@ -81,7 +80,7 @@ class SlipDetector:
         return SlipChange(slipping=False, since=measured.stamp, text=text)
 
     def scans(self, measured: ScanMeasurement) -> SlipChange | None:
-        """Take the motion between two scans; return a change of the result."""
+        """Add the motion between two scans; return a change of the result."""
         self._scanned, self.doubted = measured.stamp, False
         if self._motions and self._motions[-1].stamp != measured.since:
             self._motions.clear()
@@ -113,12 +112,12 @@ class SlipDetector:
         return round(self._config.window * SECOND)
 
     def _agreed(self) -> None:
-        """Drop the older windows."""
+        """Drop older windows."""
         while len(self._motions) > 1:
             self._motions.popleft()
 
     def _compared(self, count: int) -> tuple[float, int, str] | None:
-        """Compare wheels with the last ``count`` motions: return distance in deviations, start (ns), and words."""
+        """Compare the wheels with the last ``count`` motions; return deviation, start (ns) and description."""
         motions = list(self._motions)[-count:]
         since, stamp = motions[0].since, motions[-1].stamp
         wheels_moved = self._wheel_motion(since, stamp)
@@ -128,7 +127,7 @@ class SlipDetector:
         for one in motions:
             moved = compose(moved, one.delta)
         _, by_later = compose_jacobians(moved, np.zeros(3))
-        # Only the places of the first and the last scan err: the errors in between have cancelled.
+        # Only the errors of the first and the last place remain: the errors in between cancel.
         spread = motions[0].covariance + by_later @ motions[-1].covariance @ by_later.T
         delta, noise = wheels_moved
         off = delta - moved
@@ -139,13 +138,13 @@ class SlipDetector:
         return distance, since, text
 
     def heading(self, stamp: int, yaw: float) -> SlipChange | None:
-        """Take an undisturbed heading (counter-clockwise, rad); it is used if there are no scans."""
+        """Add an undisturbed heading (counter-clockwise, rad), used if there are no scans."""
         jitter = 0.01  # standard deviation of a compass heading against the one a second before, rad
         if self._headings:
             last, before = self._headings[-1]
             # 3.0: maximum turn rate of a robot, rad/s
             if abs(wrap_angle(yaw - before)) > jitter * 4 + 3.0 * (stamp - last) / SECOND:
-                # The field has changed: nothing turns so fast.
+                # The field has changed: no robot turns so fast.
                 self._headings.clear()
         self._headings.append((stamp, yaw))
         while len(self._headings) > 1 and stamp - self._headings[1][0] >= SPAN:
@@ -168,13 +167,13 @@ class SlipDetector:
         return self._judged(distance, since, text)
 
     def forget_headings(self) -> None:
-        """Forget the headings after a disturbance of the compass: later ones are not compared with them."""
+        """Forget the headings before a disturbance of the compass."""
         self._headings.clear()
 
     def _wheel_motion(self, since: int, stamp: int) -> tuple[Array, Array] | None:
         """Return the motion of the wheels between two instants and its covariance, (3,) and (3, 3); None if unknown."""
         trail = self._trail
-        # (SECOND // 8): maximum lead of a scan over the wheels, ns; the wheels are assumed to keep moving
+        # (SECOND // 8): maximum lead of a scan over the wheels, ns; the wheels' velocity is extrapolated
         if len(trail) < 2 or since < trail[0][0] or stamp > trail[-1][0] + (SECOND // 8):
             return None
         stamps = np.array([row[0] - since for row in trail], dtype=np.float64)

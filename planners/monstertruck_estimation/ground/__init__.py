@@ -1,1 +1,1 @@
-"""Tilt and roughness of the ground."""
+"""Grid of the ground's tilt and roughness."""

@@ -1,4 +1,4 @@
-"""Tilt and roughness of the ground by cells, from the motion of the robot over it and from hits of tilted scans."""
+"""Grid of the ground's tilt and roughness, from the robot's motion over it and from tilted scans that hit it."""
 
 import io
 from pathlib import Path
@@ -19,7 +19,7 @@ FILE: Final = "ground.npz"
 GROUND_RESOLUTION: Final = 0.1
 """Edge of a cell (m)."""
 LARGEST_GROUND_GRID: Final = 2000
-"""Maximum number of cells per side; cells outside are left out."""
+"""Maximum number of cells per side; cells beyond are ignored."""
 
 Cells = NDArray[np.int64]
 
@@ -34,18 +34,19 @@ class GroundGrid:
         self._layers: NDArray[np.float32] = np.zeros((2, 0, 0), np.float32)
         """Tilt (rad) and roughness (m); shape (2, rows, columns)."""
         self._quantised: NDArray[np.uint8] = np.zeros((2, 0, 0), np.uint8)
-        """The layers as published: quantised only where observed, as a whole large map takes milliseconds."""
+        """Layers in the units of the message; only observed cells are converted: a whole large map takes milliseconds.
+        """
 
     @property
     def empty(self) -> bool:
-        """Whether nothing was observed."""
+        """Whether the grid has no observations."""
         return not self._counts.any()
 
     def observe(self, points: Array, tilt: ArrayLike, roughness: ArrayLike) -> None:
         """Add an observation to the cells of ``points``, (n, 2) (m).
 
         Args:
-            points: at least one in each observed cell; the first one is used.
+            points: at least one point in each observed cell; only the first in a cell is used.
             tilt: tilt of the ground (rad); one value or n.
             roughness: standard deviation of its height (m); one value or n.
         """
@@ -55,7 +56,7 @@ class GroundGrid:
         if not len(cells) or not self._grow(cells.min(axis=0), cells.max(axis=0)):
             return
         columns, rows = (cells - self._corner).T
-        # 20: maximum number of values in a cell's mean; later values are weighted as if there had been so many
+        # 20: maximum weight of a cell's mean, in values
         count = self._counts[rows, columns] = np.minimum(self._counts[rows, columns] + 1, 20)
         values = np.stack([np.broadcast_to(value, len(points))[first] for value in (tilt, roughness)])
         self._layers[:, rows, columns] += (values - self._layers[:, rows, columns]) / count
@@ -117,7 +118,7 @@ class GroundGrid:
         return grid
 
     def _grow(self, low: Cells, high: Cells) -> bool:
-        """Make room for the cells from ``low`` to ``high``; False if that would be too large."""
+        """Extend the grid to the cells from ``low`` to ``high``; return False if it would become too large."""
         size = np.array(self._counts.shape[::-1])
         if not size.all():
             self._corner, size = low.copy(), np.zeros(2, np.int64)
@@ -151,10 +152,10 @@ def planes(points: Array) -> tuple[Array, Array, Array]:
         points: shape (n, 3) (m).
 
     Returns:
-        The points in squares with enough of them, (k, 2), with the tilt of their square's plane, (k,) (rad), and the
-        standard deviation of the heights about it, (k,) (m).
+        The points in squares with enough points, (k, 2); the tilt of their square's plane, (k,) (rad); and the standard
+        deviation of the heights about it, (k,) (m).
     """
-    x, y = np.floor(points[:, :2] / 0.3).astype(np.int64).T  # side of the squares a plane is fitted to, m
+    x, y = np.floor(points[:, :2] / 0.3).astype(np.int64).T  # side of the squares with one fitted plane each, m
     _, which, counts = np.unique(_key(x, y), return_inverse=True, return_counts=True)
 
     def mean(values: Array) -> Array:
@@ -174,5 +175,5 @@ def planes(points: Array) -> tuple[Array, Array, Array]:
 
 
 def _key(x: NDArray[np.int64], y: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return one number for both indices of a cell or square."""
+    """Return one number for the index pair of a cell or square."""
     return np.asarray(x * (1 << 24) + y)

@@ -33,24 +33,24 @@ FIT_EVERY: Final = SECOND
 
 
 class GroundService:
-    """Publish the ground as felt and seen by the robot.
+    """Publish the ground as measured by the robot's tilt and its tilted scans.
 
     Args:
         config: periods.
-        clock: time.
+        clock: the service's clock.
         footprint: length and width of the robot (m).
         wheelbase: wheelbase (m).
         mount: mount of the lidar; None without a lidar.
         compass: tilt of the body.
         angles: body and mount at the time of scans; None without a lidar.
-        pose: pose in the frame of the routes.
+        pose: pose in the routes' frame.
         scan: points on the ground; None without a lidar.
         slip: slip by the odometry.
-        out: ``state/ground``.
-        events: receives failures to load or save.
-        offload: runs the reading and writing of files.
+        out: publisher of ``state/ground``.
+        events: sink of load and save failures.
+        offload: runs file access outside the event loop.
         load: folder of the map known at the start; None without one.
-        save: folder of the saved grid, and the run that makes the map; None to save nothing.
+        save: folder of the saved grid, and the run that builds the map; None to save nothing.
     """
 
     name = ServiceName.GROUND.value
@@ -84,7 +84,7 @@ class GroundService:
         self._felt: Tilt | None = None
         self._marked: Array | None = None
         self._travelled: tuple[float, float] | None = None
-        """End of the integration of the robot's height: x and y (m)."""
+        """End of the path along which the robot's height is integrated: x and y (m)."""
         self._height = 0.0
         self._hits: deque[tuple[int, Array]] = deque()
         self._changed = False
@@ -113,7 +113,7 @@ class GroundService:
             await self._keep()
 
     async def _begin(self) -> None:
-        """Read the grid of the known map."""
+        """Load the grid of the known map."""
         if (folder := self._load) is None:
             return
         try:
@@ -153,7 +153,7 @@ class GroundService:
         return now - slip.received <= FUSION.fresh_for() * SECOND
 
     def _climb(self, pose: Array, pitch: float) -> None:
-        """Integrate the robot's own height."""
+        """Integrate the robot's height along its path."""
         x, y, yaw = pose.tolist()
         if self._travelled is not None:
             forward = (x - self._travelled[0]) * math.cos(yaw) + (y - self._travelled[1]) * math.sin(yaw)
@@ -171,7 +171,7 @@ class GroundService:
         valid = np.isfinite(scan.ranges) & (rise < -0.03)  # minimum fall, in metres per metre
         ranges, rise, bearings = scan.ranges[valid], rise[valid], bearings[valid]
         heights = mount.z + ranges * rise
-        # 0.10: beams that point down and end this close to the robot's own level hit the ground, m
+        # 0.10: maximum height of a beam's end above the robot's own level for a ground hit, m
         hit = np.flatnonzero(abs(heights) < 0.10)
         # 60: maximum number of points per scan: the fit of planes stays well below a millisecond
         hit = hit[:: max(math.ceil(len(hit) / 60), 1)]
@@ -181,8 +181,8 @@ class GroundService:
         self._hits.append((scan.stamp, np.column_stack((in_frame, heights[hit] + self._height))))
 
     def _fit(self, now: int) -> None:
-        # 3 * SECOND: time over which such points are combined, ns: the robot's own height is integrated from its pitch
-        # and drifts
+        # 3 * SECOND: time over which such points are combined, ns; the robot's height is integrated from its pitch and
+        # drifts
         while self._hits and self._hits[0][0] < now - 3 * SECOND:
             self._hits.popleft()
         if self._hits:

@@ -1,30 +1,30 @@
-"""Tilt under the robot, and how much it has changed lately."""
+"""Tilt under the robot and its recent variation."""
 
 import math
 
 
 class TerrainEstimator:
-    """Tilt, and its standard deviation over the last seconds (both axes together, exponentially weighted).
+    """Track the tilt and its standard deviation over the last seconds (both axes, exponentially weighted).
 
     Args:
-        window: time constant of the standard deviation, s.
+        window: time constant of the standard deviation (s).
     """
 
     def __init__(self, window: float) -> None:
         self._window = window
         self.tilt = 0.0
-        """Angle between the robot's z axis and the vertical, rad."""
+        """Angle between the robot's z axis and the vertical (rad)."""
         self._mean = (0.0, 0.0)
         self._variance = 0.0
         self._t: float | None = None
 
     @property
     def roughness(self) -> float:
-        """Standard deviation, rad."""
+        """Standard deviation (rad)."""
         return math.sqrt(self._variance)
 
     def add(self, t: float, roll: float, pitch: float) -> None:
-        """Count a sample taken at ``t`` seconds; one that is not newer than the last is left out."""
+        """Add a sample at time ``t`` (s); samples not later than the last are ignored."""
         self.tilt = math.acos(min(math.cos(roll) * math.cos(pitch), 1.0))
         if self._t is None:
             self._mean = (roll, pitch)
