@@ -1,4 +1,4 @@
-"""Yaw rate of an inertial measurement unit: without its bias, and checked against the wheels before it is used."""
+"""Yaw rate of an inertial measurement unit: corrected for its bias and checked against the wheels."""
 
 import math
 from collections import deque
@@ -10,30 +10,30 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Positive, Schema
 
 RESTING_DISTANCE: Final = 1e-4
-"""Maximum distance of the fastest shaft between two readings of a standing robot, m."""
+"""Maximum distance of the fastest shaft between two readings at standstill (m)."""
 
 
 class GyroConfig(Schema):
-    """Trust in the yaw rate of an IMU."""
+    """Trust in the IMU's yaw rate."""
 
     rest: Positive = 0.5
     """Minimum time at rest to measure the bias (s)"""
     max_bias: Positive = 0.1
-    """Maximum bias (rad/s): at a higher mean rate the robot is turned by hand"""
+    """Maximum bias (rad/s): a higher mean rate means that the robot is turned by hand"""
     window: Positive = 1.5
-    """Seconds over which turns by the gyroscope and by the wheels are compared"""
+    """Window over which the turns by gyroscope and wheels are compared (s)"""
     tolerance: Positive = 0.12
-    """Tolerated difference, rad"""
+    """Tolerated difference of the turns (rad)"""
     share: Annotated[float, Field(ge=0, lt=1)] = 0.35
-    """Tolerated difference as a share of the greater turn: wheels slip"""
+    """Tolerated difference as a share of the greater turn, because wheels slip"""
     proof: Positive = 0.3
-    """Minimum turn of the wheels in the window before an excluded IMU that agrees returns, rad"""
+    """Minimum turn of the wheels in the window for readmitting a rejected IMU that agrees (rad)"""
     drift: Annotated[float, Field(ge=0)] = 5e-5
-    """How fast the bias may change after a rest, rad/s^2: as it warms up by two degrees a minute"""
+    """Maximum drift of the bias after a rest (rad/s^2), as the device warms up by two degrees a minute"""
 
 
 class Gyro:
-    """Yaw rates of the IMU, in base.
+    """Corrects the yaw rates of the IMU in base and compares them with the wheels.
 
     Args:
         config: limits.
@@ -41,41 +41,41 @@ class Gyro:
 
     def __init__(self, config: GyroConfig) -> None:
         self._config = config
-        self._rates: deque[tuple[int, float]] = deque(maxlen=100)  # rates that are kept
+        self._rates: deque[tuple[int, float]] = deque(maxlen=100)  # maximum number of stored rates
         self._rest: list[float] = []
         self._rested = 0.0
         self._turns: deque[tuple[int, float, float]] = deque()
-        """(ns, turn by the wheels, turn by the gyroscope), rad."""
+        """Stamp (ns), turn by the wheels and turn by the gyroscope (rad)."""
         self._long: deque[tuple[int, float, float, float]] = deque()
-        """(ns, turn by the wheels, turn by the gyroscope, tolerated difference), rad."""
+        """Stamp (ns), turn by the wheels, turn by the gyroscope and tolerated difference (rad)."""
         self._sums = (0.0, 0.0)
-        """Sums over ``_long``: difference of the turns, and tolerated difference, rad."""
+        """Sums over ``_long``: difference of the turns, and tolerated difference (rad)."""
         self._known = 0
-        """When the bias was last known, ns."""
+        """Time of the last bias measurement (ns)."""
         self.bias: float | None = None
         """rad/s; None: the robot has not stood long enough."""
         self.trusted = True
-        """Whether it agrees with the wheels."""
+        """Whether the IMU agrees with the wheels."""
         self.difference = 0.0
-        """Turn by the gyroscope less turn by the wheels in the window, rad."""
+        """Turn by the gyroscope minus turn by the wheels in the window (rad)."""
         self._left_out: int | None = None
-        """Since when it is not trusted, ns."""
+        """Start of the distrust (ns)."""
 
     def observe(self, stamp: int, rate: float) -> None:
-        """Take a yaw rate, rad/s, at ``stamp``, ns."""
+        """Add a yaw rate (rad/s) at ``stamp`` (ns)."""
         self._rates.append((stamp, rate))
 
     def turned(self, since: int, stamp: int, wheels: float | None, distance: float) -> float | None:
-        """Mean yaw rate between two readings of the wheels, rad/s; None to use the wheels.
+        """Return the mean yaw rate between two readings of the wheels (rad/s); None to use the wheels' own.
 
         Args:
-            since: ns.
-            stamp: ns.
-            wheels: mean yaw rate by the wheels, rad/s; None if they slip, and are not compared.
+            since: stamp of the earlier reading (ns).
+            stamp: stamp of the later reading (ns).
+            wheels: mean yaw rate by the wheels (rad/s); None while they slip, which skips the comparison.
             distance: distance of the fastest shaft, m.
         """
         found = [rate for at, rate in self._rates if since < at <= stamp]
-        # SECOND // 10: a rate this much older than the wheels' reading still stands for it, ns
+        # SECOND // 10: maximum age of a rate relative to the wheels' reading, ns
         if not found and self._rates and stamp - self._rates[-1][0] <= SECOND // 10:
             found = [self._rates[-1][1]]
         if not found:
@@ -97,9 +97,9 @@ class Gyro:
         return rate if self.trusted else None
 
     def variance(self, stamp: int, dt: float, distance: float) -> float:
-        """Growth of the variance of the turn since the last rest by the drift of the bias in ``dt`` seconds, rad^2.
+        """Return the growth of the turn's variance in ``dt`` seconds (rad^2): the bias has drifted since the last rest.
 
-        A bias that has changed at a rate d for the time T has turned the heading by d T^2 / 2.
+        A bias that drifts at a rate d for a time T turns the heading by d T^2 / 2.
         """
         if distance <= RESTING_DISTANCE or self.bias is None:
             return 0.0
@@ -107,13 +107,13 @@ class Gyro:
         return self._config.drift**2 * rested**3 * dt
 
     def _forget(self) -> None:
-        """Start a new comparison."""
+        """Start the comparison again."""
         self._turns.clear()
         self._long.clear()
         self._sums = (0.0, 0.0)
 
     def wheels_slipped(self, since: int) -> None:
-        """Something else has shown that the wheels slip since then, ns: a disagreement with them was their fault."""
+        """Discard the disagreement since ``since`` (ns): another sensor has shown that the wheels slipped."""
         self._forget()
         if self._left_out is not None and self._left_out >= since:
             self.trusted, self._left_out = True, None
@@ -142,16 +142,16 @@ class Gyro:
             self.trusted = agrees
 
     def _judge_long(self, stamp: int, wheels: float, gyro: float, distance: float) -> None:
-        """Give the bias up, until the robot rests, where it has crept away: too slowly for the short window."""
+        """Drop a bias that has crept away too slowly for the short window, until the robot rests."""
         config, rows = self._config, self._long
         if not self.trusted:
             rows.clear()
             self._sums = (0.0, 0.0)
             return
-        # 0.05: permanent curvature error of the wheels, rad/m
+        # 0.05: maximum constant curvature error of the wheels, rad/m
         rows.append((stamp, wheels, gyro, config.share * abs(wheels) + 0.05 * distance))
         off, allowed = self._sums[0] + gyro - wheels, self._sums[1] + rows[-1][3]
-        long = 20 * SECOND  # second, longer window of the comparison, ns: it reveals a drifting bias
+        long = 20 * SECOND  # second, longer comparison window, ns: it reveals a drifting bias
         while stamp - rows[0][0] > long:
             _, by_wheels, by_gyro, may = rows.popleft()
             off, allowed = off - (by_gyro - by_wheels), allowed - may

@@ -1,8 +1,8 @@
-"""Whether the headings of a compass turn with the robot or against it.
+"""Detection of compass headings that turn against the robot.
 
 A heading of the wrong sign is not an outlier: it is right near the heading where north was found, and while the robot
-turns slowly it pulls the yaw with it, within any outlier gate. Only its turns show the fault: they oppose the turns of
-the wheels or of an inertial measurement unit.
+turns slowly it pulls the yaw along within any outlier gate. Only its turns reveal the fault: they oppose the turns by
+the wheels or an inertial measurement unit.
 """
 
 from collections import deque
@@ -21,20 +21,20 @@ class _Row(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ContraryTurn:
-    """Headings that turned against the robot."""
+    """Compass turn opposite to the robot's turn."""
 
     robot: float
-    """Turn of the robot, rad."""
+    """Turn of the robot (rad)."""
     headings: float
-    """Turn by the headings, rad."""
+    """Turn by the headings (rad)."""
     distance: float
-    """Distance travelled meanwhile, m."""
+    """Distance travelled during the turn (m)."""
     correction: float
-    """Correction of the yaw by these headings, rad."""
+    """Correction of the yaw by these headings (rad)."""
 
     @property
     def text(self) -> str:
-        """Text for the log."""
+        """Description for the log."""
         return (
             f"the compass turned {self.headings:+.2f} rad while the robot turned {self.robot:+.2f}: check the "
             "compass's sign"
@@ -42,38 +42,38 @@ class ContraryTurn:
 
 
 class HeadingTurns:
-    """Compares the turns of headings with the robot's turns."""
+    """Compare the turns of headings with the robot's turns."""
 
     def __init__(self) -> None:
         self._rows: deque[_Row] = deque()
         self._turn = self._distance = self._heading = self._correction = 0.0
         self._last: float | None = None
         self.contrary: ContraryTurn | None = None
-        """The turn that showed it; None while headings turn with the robot."""
+        """Evidence of opposite turns; None while the headings turn with the robot."""
 
     def moved(self, turn: float, distance: float) -> None:
-        """The robot turned by ``turn``, rad, without the compass, over ``distance``, m."""
+        """Add a turn of the robot without the compass (rad), over ``distance`` (m)."""
         self._turn += turn
         self._distance += distance
 
     def corrected(self, by: float) -> None:
-        """A heading corrected the yaw by so much, rad."""
+        """Add a correction of the yaw by a heading (rad)."""
         self._correction += by
 
     def forget(self) -> None:
-        """Start a new comparison: the field or the wheels were disturbed."""
+        """Start the comparison again after a disturbance of the field or the wheels."""
         self._rows.clear()
 
     def observe(self, yaw: float) -> bool:
-        """Take a heading, rad, counter-clockwise; whether it changed ``contrary``."""
+        """Add a counter-clockwise heading (rad); return whether it changed ``contrary``."""
         if self._last is not None:
             self._heading += wrap_angle(yaw - self._last)
         self._last = yaw
         rows = self._rows
         rows.append(_Row(self._turn, self._distance, self._heading, self._correction))
-        # turn of the robot over which the headings are compared, rad: several times the error that iron nearby causes
+        # minimum turn of the robot for a comparison, rad: several times the error caused by iron nearby
         proof = 0.25
-        # Within 3 m: a drift of the wheels over a long distance does not count.
+        # Within 3 m: over a longer distance the wheels' drift dominates.
         while self._distance - rows[0].distance > 3.0 or (len(rows) > 2 and abs(self._turn - rows[1].turn) >= proof):
             rows.popleft()
         first, before = rows[0], self.contrary
@@ -81,7 +81,7 @@ class HeadingTurns:
         if abs(turn) < proof:
             return False
         share = heading / turn
-        # least share of the turn that the headings must show, with the same or the opposite sign, for a decision
+        # minimum share of the turn, with equal or opposite sign, in the headings for a decision
         alike = 0.5
         if share <= -alike:
             self.contrary = before or ContraryTurn(

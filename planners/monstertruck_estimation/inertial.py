@@ -1,7 +1,7 @@
-"""Inertial measurement unit for the odometry: its yaw rate over level ground, and the body's tilt.
+"""Inertial measurement unit for odometry: yaw rate over level ground, and tilt of the body.
 
-The tilt is a complementary filter: the gyroscopes turn the vertical, the specific force draws it back (Mahony et al.
-2008, the direct form with one vector). The body's own acceleration averages out over 2 s.
+The tilt comes from a complementary filter: the gyroscopes rotate the vertical, and the specific force corrects it
+(Mahony et al. 2008, the direct form with one vector). The body's own acceleration averages out over 2 s.
 """
 
 import math
@@ -19,13 +19,13 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Imu, Vector3
 
 LONGEST_SILENCE: Final = 0.5
-"""Maximum gap between measurements before it restarts, s."""
+"""Maximum gap between measurements before the filter restarts (s)."""
 STEEPEST: Final = 0.7
-"""Minimum vertical component of the body's z axis for a driving robot."""
+"""Minimum vertical component of the body's z axis of a driving robot."""
 
 
 class InertialTilt:
-    """The vertical in base, by angular velocities and specific forces in base."""
+    """Estimate the vertical in base from angular velocities and specific forces."""
 
     def __init__(self) -> None:
         self._up: Xyz | None = None
@@ -33,34 +33,34 @@ class InertialTilt:
         self._felt = 0
 
     def observe(self, stamp: int, rate: Xyz, force: Xyz) -> None:
-        """Take a measurement at ``stamp``, ns: rad/s and m/s^2; one that is not later is passed over."""
+        """Add a measurement at ``stamp`` (ns), in rad/s and m/s^2; ignore it unless later than the last."""
         dt = (stamp - self._stamp) / SECOND
         if self._up is not None and dt <= 0.0:
             return
         strength = math.hypot(*force)
-        # 1.0: maximum difference between force and gravity for an update of the vertical, m/s^2
+        # 1.0: maximum difference of force and gravity in a correction of the vertical, m/s^2
         felt = _scaled(force, 1.0 / strength) if abs(strength - GRAVITY) < 1.0 else None
         self._felt = self._felt if felt is None else stamp
-        # 5.0: maximum time without a plausible force before the tilt is unknown, s
+        # 5.0: maximum time without a plausible force, s; then the tilt is unknown
         if self._up is None or dt > LONGEST_SILENCE or stamp - self._felt > 5.0 * SECOND:
             up = felt
         else:
             up = added(self._up, _scaled(_cross(self._up, rate), dt))
             if felt is not None:
-                vertical_time = 2.0  # time constant of the vertical towards the specific force, s
+                vertical_time = 2.0  # time constant of the correction of the vertical by the specific force, s
                 up = added(_scaled(up, 1.0 - dt / vertical_time), _scaled(felt, dt / vertical_time))
         self._up = None if up is None else _scaled(up, 1.0 / math.hypot(*up))
         self._stamp = stamp
 
     def tilt(self, now: int) -> Tilt | None:
-        """Tilt of the body at ``now``, ns; None if unknown."""
+        """Return the body's tilt at ``now`` (ns); None if unknown."""
         if self._up is None or self._up[2] < STEEPEST or now - self._stamp > LONGEST_SILENCE * SECOND:
             return None
         x, y, z = self._up
         return Tilt(math.atan2(y, z), -math.asin(x))
 
     def yaw_rate(self, rate: Xyz) -> float:
-        """Rate of the heading at an angular velocity of base, rad/s; about its z axis where the tilt is not known."""
+        """Return the heading rate for an angular velocity of base (rad/s); its z component if the tilt is unknown."""
         if self._up is None or self._up[2] < STEEPEST:
             return rate[2]
         _, y, z = self._up
@@ -68,11 +68,11 @@ class InertialTilt:
 
 
 class Inertial:
-    """An inertial measurement unit in base.
+    """Inertial measurement unit in the base frame.
 
     Args:
         config: trust in its yaw rate.
-        mount: from its axes to base.
+        mount: rotation from the unit's axes to base.
     """
 
     def __init__(self, config: GyroConfig, mount: Quaternion) -> None:
@@ -81,11 +81,11 @@ class Inertial:
         self._axes = tuple(rotate(mount, axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
 
     def observe(self, imu: Imu) -> None:
-        """Take a measurement."""
+        """Add a measurement."""
         self.gyro.observe(imu.stamp, self.turn_rate(imu))
 
     def turn_rate(self, imu: Imu) -> float:
-        """Take a measurement; the rate of the heading with the gyroscope's bias, rad/s."""
+        """Add a measurement; return the heading rate including the gyroscope's bias (rad/s)."""
         rate, force = self._in_base(imu.angular_velocity), self._in_base(imu.linear_acceleration)
         self.vertical.observe(imu.stamp, rate, force)
         return self.vertical.yaw_rate(rate)
@@ -96,12 +96,12 @@ class Inertial:
 
 
 class InertialInput:
-    """Feeds measurements of the bus to an ``Inertial``; reports when its yaw rate and the wheels disagree.
+    """Pass IMU messages to an ``Inertial``, and report disagreement between its yaw rate and the wheels.
 
     Args:
         inertial: the unit.
-        measured: its measurements.
-        events: where a disagreement is reported.
+        measured: messages of the unit.
+        events: sink of the reports.
         source: source of the events.
     """
 
@@ -118,7 +118,7 @@ class InertialInput:
             self.inertial.observe(imu)
 
     def report(self) -> None:
-        """Report a change of trust in its yaw rate."""
+        """Report a change of trust in the yaw rate."""
         gyro = self.inertial.gyro
         if gyro.trusted is self._trusted:
             return

@@ -1,4 +1,4 @@
-"""Dead reckoning: motor turns along the steered arc, the heading held by the compass.
+"""Dead reckoning: motor turns along the steered arc, with the heading corrected by the compass.
 
 Between two drive readings the pose is a prediction, and its covariance grows with the reading's age.
 """
@@ -33,14 +33,14 @@ from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedbac
 from monstertruck_schemas.state import Odometry
 
 SOURCE_TIMEOUT: Final = SECOND
-"""Time that a sensor is listed as a source after a reading, ns."""
+"""Time for which a sensor remains listed as a source after a reading (ns)."""
 
 
 _NINE: Final = Struct("9d")
 
 
 class PlanarCovariance(NamedTuple):
-    """Covariance of (x, y, yaw) as its upper triangle, m^2, m rad, rad^2: so few plain floats are faster than numpy."""
+    """Upper triangle of the covariance of (x, y, yaw) (m^2, m rad, rad^2); plain floats are faster than numpy here."""
 
     xx: float = 0.0
     xy: float = 0.0
@@ -50,7 +50,7 @@ class PlanarCovariance(NamedTuple):
     ww: float = 0.0
 
     def moved(self, dx: float, dy: float) -> "PlanarCovariance":
-        """After a motion (dx, dy), m, in the frame of the pose: the uncertain yaw turns it."""
+        """Return the covariance after a motion (dx, dy) in the frame of the pose (m), rotated by the uncertain yaw."""
         xx, xy, yy, xw, yw, ww = self
         ahead, aside = xw - dy * ww, yw + dx * ww
         return PlanarCovariance(
@@ -58,70 +58,70 @@ class PlanarCovariance(NamedTuple):
         )
 
     def plus(self, other: Iterable[float]) -> "PlanarCovariance":
-        """Sum with an independent covariance."""
+        """Return the sum with an independent covariance."""
         return PlanarCovariance(*map(operator.add, self, other))
 
     def corrected(self, gain_x: float, gain_y: float, gain: float) -> "PlanarCovariance":
-        """After an update with a yaw of these gains."""
+        """Return the covariance after a yaw update with these gains."""
         xx, xy, yy, xw, yw, ww = self
         return PlanarCovariance(
             xx - gain_x * xw, xy - gain_x * yw, yy - gain_y * yw, xw - gain_x * ww, yw - gain_y * ww, ww - gain * ww
         )
 
     def matrix(self) -> Array:
-        """All nine numbers, row-major; read-only."""
+        """Return all nine numbers, row-major and read-only."""
         xx, xy, yy, xw, yw, ww = self
         return np.frombuffer(_NINE.pack(xx, xy, xw, xy, yy, yw, xw, yw, ww))
 
 
 class CompassConfig(Schema):
-    """How the compass holds the heading."""
+    """Correction of the heading by the compass."""
 
     noise: Positive = 0.05
-    """Standard deviation of a heading, rad; larger than the sensor's own, because its errors are correlated in time."""
+    """Standard deviation of a heading (rad); larger than the sensor's own: its errors are correlated in time."""
     gate: Positive = 3.0
-    """Outlier gate: a heading further off than this many standard deviations is rejected."""
+    """Outlier gate: maximum deviation of an accepted heading, in standard deviations."""
     alignment: Annotated[int, Field(ge=1)] = 10
-    """Headings averaged at the start to find north in the odom frame, unless the truck drives off earlier."""
+    """Number of headings averaged at the start to find north in odom, unless the truck drives off earlier."""
 
 
 class OdometrySettings(Schema):
-    """Base of the settings of every odometry."""
+    """Common settings of all odometry kinds."""
 
     kind: str
     rate: Annotated[float, Field(gt=0, le=200)] = 50.0
-    """Poses per second."""
+    """Publishing rate of poses (1/s)."""
 
 
 class OdometryConfig(OdometrySettings):
-    """Dead reckoning: start pose and noise."""
+    """Dead reckoning: initial pose and noise."""
 
     kind: Literal["reckoning"] = "reckoning"
     start: Pose2D = Pose2D(x=0.0, y=0.0, yaw=0.0)
-    """Pose of base in odom at the start, m and rad."""
+    """Initial pose of base in odom (m, rad)."""
     distance_noise: NotNegative = 0.02
-    """Standard deviation of the distance per root metre driven, m."""
+    """Standard deviation of the distance per root metre driven (m)."""
     lateral_noise: NotNegative = 0.01
-    """Standard deviation of sideways slip per root metre driven, m."""
+    """Standard deviation of sideways slip per root metre driven (m)."""
     yaw_noise: NotNegative = 0.05
-    """Standard deviation of the heading per root metre driven, rad."""
+    """Standard deviation of the heading per root metre driven (rad)."""
     speed_noise: NotNegative = 0.05
-    """Standard deviation of the speed while it is predicted, m/s."""
+    """Standard deviation of the predicted speed (m/s)."""
     turn_noise: NotNegative = 0.1
-    """Standard deviation of the yaw rate while it is predicted, rad/s."""
+    """Standard deviation of the predicted yaw rate (rad/s)."""
     max_prediction: Positive = 0.3
-    """Time of prediction without a drive reading, s; then the pose stays, and its covariance keeps growing."""
+    """Maximum time of prediction without a drive reading (s); then the pose stays, and its covariance grows."""
     max_speed: Positive = 0.6
-    """A drive position that would need more than this, m/s, is a new origin (the drive restarted), not a motion."""
+    """Maximum speed between two drive positions (m/s); beyond it, the drive has restarted with a new origin."""
     compass: CompassConfig | None = CompassConfig()
-    """Null: heading by the wheels alone."""
+    """Null uses the wheels' heading alone."""
     gyro: GyroConfig | None = GyroConfig()
-    """Yaw rate of an inertial measurement unit, where there is one; null leaves it out"""
+    """Yaw rate of an inertial measurement unit, if the robot has one; null leaves it out"""
 
 
 @dataclass(frozen=True, slots=True)
 class OdometryEstimate:
-    """Pose of base in odom, twist in base, at one instant."""
+    """Pose of base in odom and twist in base at one instant."""
 
     pose: Pose2
     """x, y (m), yaw (rad, in [-pi, pi])."""
@@ -132,43 +132,43 @@ class OdometryEstimate:
     twist_covariance: Array
     """Shape (9,), row-major."""
     age: float
-    """Age of the latest drive reading, s."""
+    """Age of the latest drive reading (s)."""
     sources: tuple[str, ...]
 
 
 class SensorInput(Protocol):
-    """Messages of an additional sensor, passed to the estimator by its own adapter."""
+    """Additional sensor of an ``OdometryService``, with an adapter that passes its messages to the estimator."""
 
     def take(self) -> None:
-        """Pass new messages to the estimator, before the wheels' messages."""
+        """Pass new messages to the estimator, before those of the wheels."""
 
     def report(self) -> None:
         """Emit events about changes."""
 
 
 class OdometryEstimator(Protocol):
-    """Estimator of an ``OdometryService``."""
+    """Pose estimator of an ``OdometryService``."""
 
     def observe_steering(self, feedback: SteeringFeedback) -> None:
-        """Take the servo angles being sent."""
+        """Add the commanded servo angles."""
 
     def observe_drive(self, *shafts: DriveFeedback) -> None:
-        """Take a reading of every driven shaft."""
+        """Add a reading of every driven shaft."""
 
     def observe_attitude(self, attitude: Attitude) -> None:
-        """Take heading and tilt."""
+        """Add heading and tilt."""
 
     def estimate(self, now: int) -> OdometryEstimate | None:
-        """Pose at ``now`` (ns); None while nothing is known."""
+        """Return the pose at ``now`` (ns); None before the first reading."""
 
 
 class DeadReckoning:
-    """Extended Kalman filter of (x, y, yaw): predicted by the drive, corrected in yaw by the compass.
+    """Extended Kalman filter of (x, y, yaw), predicted by the drive and corrected in yaw by the compass.
 
     Args:
-        config: start and noise.
-        chassis: from motors and servos to the body's motion.
-        inertial: an inertial measurement unit whose yaw rate replaces the wheels' rate.
+        config: initial pose and noise.
+        chassis: maps motors and servos to the body's motion.
+        inertial: inertial measurement unit whose yaw rate replaces the wheels'; None for the wheels alone.
     """
 
     def __init__(self, config: OdometryConfig, chassis: Chassis, inertial: Inertial | None = None) -> None:
@@ -188,39 +188,39 @@ class DeadReckoning:
         self._gyro_used: int | None = None
         self._turns = HeadingTurns()
         self._otherwise = 0
-        """Headings in a row that contradict ``doubt``: outliers while they are used, or inliers while they are not."""
+        """Number of successive headings that contradict ``doubt``: outliers if it is None, otherwise inliers."""
         self.rejected_headings = 0
-        """Headings rejected by the outlier gate."""
+        """Number of headings rejected by the outlier gate."""
         self.doubt: str | None = None
-        """Why headings are rejected, for a log; None while they are used."""
+        """Reason why headings are rejected; None while they are used."""
 
     def observe_steering(self, feedback: SteeringFeedback) -> None:
-        """Take the servo angles being sent, unless the servo controller marks them untrusted."""
+        """Add the commanded servo angles, unless the servo controller marks them untrusted."""
         self._wheels.observe_steering(feedback)
 
     def observe_drive(self, *shafts: DriveFeedback) -> None:
-        """Take the position of every motor and move the pose along the arc driven since the last ones."""
+        """Add the position of every motor and move the pose along the arc since the last positions."""
         roll = self._wheels.observe_drive(*shafts)
         if roll is not None:
             self._move(roll)
 
     @property
     def _reached(self) -> int:
-        """Instant of the pose, ns."""
+        """Stamp of the pose (ns)."""
         return self._wheels.stamp
 
     @property
     def _twist(self) -> Twist2:
-        """Velocity that predicts the pose."""
+        """Velocity used to predict the pose."""
         return self._wheels.twist
 
     @property
     def _carriers(self) -> tuple[str, ...]:
-        """Sensors that move the pose now."""
+        """Sensors that currently determine the pose."""
         return ("drive",)
 
     def _move(self, roll: WheelIncrement) -> None:
-        """Predict along the arc of the wheels."""
+        """Predict along the wheels' arc."""
         dt = roll.dt
         if roll.lost:
             self._lose(dt)
@@ -243,7 +243,7 @@ class DeadReckoning:
         self._turns.moved(wz * dt, roll.distance)
 
     def observe_attitude(self, attitude: Attitude) -> None:
-        """Take a heading: the first ones determine north in odom, the others correct the yaw."""
+        """Add a heading: the first ones determine north in odom, later ones correct the yaw."""
         config = self._config.compass
         if config is None or not self._wheels.known:
             return
@@ -279,19 +279,19 @@ class DeadReckoning:
         self._turns.corrected(gain * innovation)
 
     def estimate(self, now: int) -> OdometryEstimate | None:
-        """Pose predicted to ``now`` (ns); None before the first drive reading."""
+        """Return the pose predicted to ``now`` (ns); None before the first drive reading."""
         if not self._wheels.known:
             return None
         age = max((now - self._reached) / SECOND, 0.0)
         twist = self._twist
         ahead = min(age, self._config.max_prediction)
         x, y, yaw = integrate(self._pose, *twist, ahead)
-        # The predicted motion turns with the uncertain yaw; the uncertain speed, equal in all directions, is added.
+        # The uncertain yaw rotates the predicted motion; the speed's variance is added equally in all directions.
         moved = self._covariance.moved(x - self._pose[0], y - self._pose[1])
         covariance = moved.plus(term * age**2 for term in self._drift)
         twist_covariance = self._twist_covariance
         if (waited := age - ahead) > 0.0:
-            # It may still drive: the pose stays, at speed 0, with the uncertainty of such a motion.
+            # The robot may still move: the pose stays, at speed 0, with the covariance of a possible motion.
             pace, turn = twist[0] ** 2 + twist[1] ** 2, twist[2] ** 2
             lost = PlanarCovariance(xx=pace, yy=pace, ww=turn)
             covariance = covariance.plus(term * waited**2 for term in lost)
@@ -314,7 +314,7 @@ class DeadReckoning:
         )
 
     def _contradict(self) -> None:
-        """Headings turn against the robot, or no longer do: undo their corrections, and determine north again."""
+        """Undo the corrections by headings that turn against the robot, or no longer do, and determine north again."""
         self._north, self._otherwise, self.doubt = None, 0, None
         self._aligning.clear()
         contrary = self._turns.contrary
@@ -327,13 +327,13 @@ class DeadReckoning:
         self._covariance = self._covariance.plus(PlanarCovariance(xx=aside, yy=aside, ww=by**2))
 
     def _lose(self, dt: float) -> None:
-        """The drive's counter has a new origin: add the uncertainty of an unknown motion."""
+        """Add the uncertainty of an unknown motion after the drive's counter restarted."""
         lost = (self._config.max_speed * dt) ** 2
         turned = lost * self._chassis.bicycle.curvature(0.4, -0.4) ** 2
         self._covariance = self._covariance.plus(PlanarCovariance(xx=lost, yy=lost, ww=turned))
 
     def _slipped(self, roll: WheelIncrement) -> PlanarCovariance:
-        """Covariance that slip adds along the arc."""
+        """Return the covariance added by slip along the arc."""
         (a, b, c), (d, e, f), (_, _, g) = integration_jacobians(self._pose, *roll.twist, roll.dt)[1].tolist()
         along, aside, turned = (share * roll.distance / roll.dt**2 for share in self._slip)
         return PlanarCovariance(
@@ -347,7 +347,7 @@ class DeadReckoning:
 
     def _align(self, off: float, config: CompassConfig) -> None:
         self._aligning.append(off)
-        # 0.02: maximum distance from the start of a truck that still stands there, m
+        # 0.02: maximum distance from the start of a truck at standstill, m
         if len(self._aligning) >= config.alignment or self._driven > 0.02:
             self._north = math.atan2(
                 sum(math.sin(value) for value in self._aligning), sum(math.cos(value) for value in self._aligning)
@@ -355,24 +355,24 @@ class DeadReckoning:
 
 
 def _no_events(*_: Any, **__: Any) -> None:
-    """Event sink that discards all."""
+    """Event sink that discards all events."""
 
 
 class OdometryService:
-    """Publishes odometry on an absolute schedule, in odom and, without localisation, unchanged in map.
+    """Publish odometry on an absolute schedule, in odom and, without localisation, unchanged in map.
 
     Args:
-        reckoning: the filter.
-        clock: time.
+        reckoning: pose estimator.
+        clock: the service's clock.
         drives: feedback of every driven shaft.
-        steering: servo feedback, of a body that steers.
-        compass: headings, if there is a compass.
-        odometry: ``state/odometry``.
+        steering: servo feedback; None for a body without steering.
+        compass: headings; None without a compass.
+        odometry: publisher of ``state/odometry``.
         pose: ``state/pose``; None: published by localisation.
-        imu: measurements of an inertial measurement unit, if there is one.
+        imu: measurements of the inertial measurement unit; None without one.
         encoders: encoders of wheels that are not driven, if the estimator takes them.
-        events: about rejected headings.
-        rate: poses per second.
+        events: sink of reports about rejected headings.
+        rate: publishing rate of poses (1/s).
     """
 
     name = ServiceName.ODOMETRY.value
@@ -445,7 +445,7 @@ class OdometryService:
             self.report_compass(self._reckoning.doubt)
 
     def report_compass(self, doubt: str | None, returned: str = "") -> None:
-        """Report that the headings are excluded, and why, or used again."""
+        """Report whether headings are rejected, and the reason, or used again."""
         if self._doubted is (doubt is not None):
             return
         self._doubted = doubt is not None
@@ -456,7 +456,7 @@ class OdometryService:
             self._events(Reason.HEADING_DISTURBED, Severity.WARNING, self.name, text)
 
     def accepts_compass(self) -> bool:
-        """Whether headings are used yet: they correct a pose, which begins with the first drive reading."""
+        """Return whether headings are used yet: they correct a pose, which exists from the first drive reading."""
         return bool(self._reckoned)
 
 
@@ -479,30 +479,30 @@ def _message(estimate: OdometryEstimate, now: int, seq: int) -> Odometry:
 
 @dataclass(frozen=True, slots=True)
 class OdometryContext:
-    """The robot and the bus that an odometry is built for."""
+    """Robot and bus for which an odometry kind is built."""
 
     chassis: Chassis
     clock: Clock
     bus: BusPort
     compass: bool
-    """The robot has one."""
+    """Whether the robot has a compass."""
     slam: bool
-    """SLAM publishes the pose in map and the motion between scans."""
+    """Whether SLAM publishes the pose in map and the motion between scans."""
     imu: Quaternion | None = None
     """Rotation from the axes of its IMU to base; None without an IMU."""
     encoders: bool = False
-    """Whether its rear wheels have encoders."""
+    """Whether the rear wheels have encoders."""
 
     def inertial(self, config: GyroConfig | None) -> InertialInput | None:
-        """Its IMU, if there is one and the configuration uses it."""
+        """Return the IMU; None if the robot has none or the configuration leaves it out."""
         if self.imu is None or config is None:
             return None
-        # 32: measurements of an IMU queued at most
+        # 32: maximum number of queued IMU measurements
         measured, events = self.bus.subscribe(topics.IMU, fifo(32)), self.bus.event_sink()
         return InertialInput(Inertial(config, self.imu), measured, events, OdometryService.name)
 
     def inputs(self) -> dict[str, Any]:
-        """Topics of an ``OdometryService``, by the names of its arguments."""
+        """Return the topics of an ``OdometryService`` by argument name."""
         bus, shafts, steered = self.bus, len(self.chassis.shafts), self.chassis.steered
         return {
             "drives": [bus.subscribe(topic, latest()) for topic in topics.DRIVES[:shafts]],
@@ -514,7 +514,7 @@ class OdometryContext:
 
 
 def build_reckoning(config: OdometryConfig, context: OdometryContext) -> OdometryService:
-    """The service with its topics, for the catalog."""
+    """Build the service with its topics, for the catalog."""
     imu = context.inertial(config.gyro)
     reckoning = DeadReckoning(config, context.chassis, None if imu is None else imu.inertial)
     events = context.bus.event_sink()

@@ -1,9 +1,10 @@
-"""Odometry of a tricycle by the encoders of its rear wheels, checked by its driven wheel.
+"""Odometry of a tricycle from the encoders of its rear wheels, checked against its driven wheel.
 
-The rear wheels are not driven, so they do not slip, and give speed and yaw rate without the steering angle. The driven
-front wheel gives both as well, by its rate and angle: thdot = (v_s/d) sin(alpha). Over some distance both must agree.
-An encoder that is stuck, mirrored or loose is rejected, and its measurements since the first sign of it are undone. The
-other wheel is then used with the yaw rate of the steering; without both encoders the front wheel is used alone.
+The rear wheels are not driven, so they do not slip, and they give speed and yaw rate without the steering angle. The
+driven front wheel also gives both, from its rate and angle: thdot = (v_s/d) sin(alpha). Over some distance both must
+agree. An encoder that is stuck, mirrored or loose is rejected, and its measurements since the first disagreement are
+undone. The other encoder is then combined with the yaw rate of the steering; without both encoders the front wheel is
+used alone.
 """
 
 import math
@@ -35,63 +36,63 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import DriveFeedback, WheelEncoders
 
 Pair = tuple[float, float]
-"""Values of the left and of the right wheel."""
+"""Values of the left and the right wheel."""
 
 SIDES: Final = ("left", "right")
 LATE: Final = SECOND // 5
-"""Minimum interval between two readings with one missing, ns."""
+"""Minimum interval between two readings with a missing one between them (ns)."""
 KEPT_READINGS: Final = 256
-"""Readings, and poses, that are kept."""
+"""Maximum numbers of stored readings and poses."""
 STANDS: Final = 0.2
-"""Share of the expected distance below which a wheel stands still."""
+"""Share of the expected distance below which a wheel is considered stopped."""
 
 
 class EncoderConfig(Schema):
-    """When encoders are used."""
+    """Acceptance limits of the encoders."""
 
     stretch: Positive = 0.1
-    """Latest distance to compare rear wheels and driven wheel over, m"""
+    """Distance over which rear wheels and driven wheel are compared (m)"""
     proof: Positive = 0.3
-    """Distance over which a difference must last, m; until then the driven wheel moves the pose"""
+    """Distance for which a difference must last (m); until then the driven wheel moves the pose"""
     tolerance: Positive = 0.02
-    """Tolerated difference, m"""
+    """Tolerated difference (m)"""
     share: Annotated[float, Field(ge=0, lt=1)] = 0.12
-    """Tolerated difference as a share of the greater distance: the driven wheel slips a little, the steering lags"""
+    """Tolerated difference as a share of the greater distance: the driven wheel slips, and the steering lags"""
 
 
 class RearWheelConfig(OdometryConfig):
-    """Encoders of the rear wheels; other settings as of dead reckoning."""
+    """Encoders of the rear wheels; other settings as for dead reckoning."""
 
     kind: Literal["encoders"] = "encoders"  # type: ignore[assignment]  # each kind has its own word
     encoders: EncoderConfig = EncoderConfig()
-    """How they are checked"""
+    """Acceptance limits of the encoders"""
 
 
 class EncoderVerdict(NamedTuple):
-    """Verdict of a window about the encoders."""
+    """Verdict on the encoders for one stretch."""
 
     trusted: tuple[bool, bool] = (True, True)
     slips: bool = False
-    """The driven wheel does, not they."""
+    """The driven wheel slips, not the rear wheels."""
     text: str = ""
 
     @property
     def kind(self) -> tuple[tuple[bool, bool], bool, bool]:
-        """Verdicts of one kind differ in figures only."""
+        """Whether two verdicts are of the same kind and differ in figures only."""
         return self.trusted, self.slips, bool(self.text)
 
 
 def judged(expected: Pair, counted: Pair, turned: float, least: float, config: EncoderConfig) -> EncoderVerdict | None:
-    """Plausible ones of two encoders; None if the distance is too short.
+    """Return the plausible encoders of both; None if the distance is too short.
 
-    Two that agree with each other and with the steering are right, and the driven wheel slips; two that roll as far as
-    it on average are right too, and the steering angle is wrong.
+    If both encoders agree with each other and with the steering, they are right, and the driven wheel slips. If both
+    roll as far as the driven wheel on average, they are right too, and the steering angle is wrong.
 
     Args:
-        expected: distances of the wheels by rate and angle of the front wheel, m.
-        counted: distances by the encoders, m.
-        turned: how much further the right wheel rolls than the left one, by the counted mean and the steering alone, m.
-        least: distance of some wheel for a verdict, m.
+        expected: distances of the rear wheels from rate and angle of the front wheel (m).
+        counted: distances by the encoders (m).
+        turned: difference of right and left distance, from the counted mean and the steering alone (m).
+        least: minimum distance of either wheel for a verdict (m).
         config: limits.
     """
     if max(map(abs, (*expected, *counted))) < least:
@@ -111,7 +112,7 @@ def judged(expected: Pair, counted: Pair, turned: float, least: float, config: E
         return EncoderVerdict(text=f"{text}, expected from the steering {expected[1] - expected[0]:+.2f} m")
     if abs(counted[1] - counted[0] - turned) <= config.tolerance + config.share * abs(rolled):
         share = rolled / driven if abs(driven) > config.tolerance else math.inf
-        # 1.5: share of the driven wheel's distance that both rear wheels cannot exceed
+        # 1.5: maximum distance of both rear wheels as a share of the driven wheel's distance
         if STANDS < share <= 1.5 or share == math.inf:
             text = f"the rear wheels roll {rolled:.2f} m, the driven wheel {driven:.2f} m"
             return EncoderVerdict(slips=True, text=text)
@@ -135,37 +136,37 @@ def _fault(want: float, have: float, *, agrees: bool) -> str:
 
 @dataclass(frozen=True, slots=True)
 class EncoderIncrement:
-    """Distances of both wheels between two readings, m."""
+    """Distances of both wheels between two readings (m)."""
 
     since: int
-    """ns."""
+    """Stamps of both readings (ns)."""
     stamp: int
     distances: Pair
     front: float
-    """Mean steering angle, rad."""
+    """Mean steering angle (rad)."""
 
 
 class Compared(NamedTuple):
-    """What both say of one reading of the motor."""
+    """Comparison of encoders and driven wheel over one motor reading."""
 
     since: int
-    """ns."""
+    """Stamp of the motor reading (ns)."""
     distance: float
-    """Distance of the wheel that rolled furthest, m, positive."""
+    """Distance of the wheel that rolled furthest, positive (m)."""
     expected: Pair
-    """Distance by the driven wheel, m."""
+    """Distance by the driven wheel (m)."""
     counted: Pair
-    """m."""
+    """Distances by the encoders (m)."""
     turned: float
     """See ``judged``."""
 
 
 class Encoders:
-    """Latest readings of both encoders, and trust in them.
+    """Latest readings of both encoders, and the trust in each.
 
     Args:
         config: limits.
-        chassis: the body.
+        chassis: the robot's chassis.
     """
 
     def __init__(self, config: EncoderConfig, chassis: TricycleChassis) -> None:
@@ -173,25 +174,25 @@ class Encoders:
         self.verdict = EncoderVerdict()
         self._chassis = chassis
         self._rolled: deque[tuple[int, Pair]] = deque(maxlen=KEPT_READINGS)
-        """(ns, positions in m)."""
+        """Stamp (ns) and positions (m)."""
         self._compared: deque[Compared] = deque()
         self._since: int | None = None
-        """Start of the stretch with the first difference, ns, or None."""
+        """Start of the stretch with the first difference (ns); None without one."""
         self._doubted = False
-        """The first difference speaks against an encoder."""
+        """Whether the first difference points to an encoder fault."""
 
     @property
     def believed(self) -> tuple[bool, bool]:
-        """Which of them may carry the pose."""
+        """Encoders that may determine the pose."""
         return (False, False) if self._doubted else self.verdict.trusted
 
     @property
     def stamp(self) -> int | None:
-        """Stamp of the latest reading, ns."""
+        """Stamp of the latest reading (ns)."""
         return self._rolled[-1][0] if self._rolled else None
 
     def observe(self, reading: WheelEncoders, front: float) -> EncoderIncrement | None:
-        """Distances since the last reading; None if unknown, or the reading is not later."""
+        """Add a reading; return the distances since the last one, or None if unknown or not later."""
         radius = self._chassis.drivetrain.wheel_radius
         now = (reading.left * radius, reading.right * radius)
         before = self._rolled[-1] if self._rolled else None
@@ -211,7 +212,7 @@ class Encoders:
         """Compare with the driven wheel.
 
         Returns:
-            Start of the distrust of an encoder, ns, or None.
+            Start of the distrust of an encoder (ns); None without one.
         """
         start, end = self._at(roll.since), self._at(roll.stamp)
         if roll.lost or start is None or end is None:
@@ -228,7 +229,7 @@ class Encoders:
         return self._judge()
 
     def _judge(self) -> int | None:
-        """Verdict of the latest stretch; a different verdict must be confirmed by a longer stretch after it."""
+        """Return the verdict on the latest stretch; a longer stretch must confirm a changed verdict."""
         compared, doubted, since = self._compared, self._doubted, self._since
         stretch = self.config.stretch if since is None else self.config.proof
         total = math.fsum(one.distance for one in compared)
@@ -258,7 +259,7 @@ class Encoders:
         return begun if wrong and not doubted else None
 
     def _at(self, stamp: int) -> Pair | None:
-        """Positions at an instant, m; None where they are not known."""
+        """Return the positions at an instant (m); None where unknown."""
         readings = self._rolled
         if len(readings) < 2 or stamp < readings[0][0] or stamp - readings[-1][0] > LATE:
             return None
@@ -269,12 +270,12 @@ class Encoders:
 
 
 class RearWheelReckoning(DeadReckoning):
-    """Dead reckoning whose pose the rear wheels carry while they are trusted, else the driven wheel.
+    """Dead reckoning from the rear wheels while they are trusted, otherwise from the driven wheel.
 
     Args:
-        config: start, noise, checks.
-        chassis: the body.
-        inertial: an inertial measurement unit whose yaw rate replaces that of the wheels.
+        config: initial pose, noise and checks.
+        chassis: the robot's chassis.
+        inertial: inertial measurement unit whose yaw rate replaces the wheels'; None for the wheels alone.
     """
 
     def __init__(self, config: RearWheelConfig, chassis: TricycleChassis, inertial: Inertial | None = None) -> None:
@@ -285,14 +286,14 @@ class RearWheelReckoning(DeadReckoning):
         self._increments: deque[EncoderIncrement] = deque(maxlen=KEPT_READINGS)
         self._rolls: deque[WheelIncrement] = deque(maxlen=KEPT_READINGS)
         self._kept: deque[tuple[int, Pose2, PlanarCovariance]] = deque(maxlen=KEPT_READINGS)
-        """(ns, pose, covariance) before each motion."""
+        """Stamp (ns), pose and covariance before each motion."""
         self._at: int | None = None
-        """Instant of the pose, ns."""
+        """Stamp of the pose (ns)."""
         self._carrying: WheelIncrement | None = None
-        """Latest motion by the encoders, if they carry the pose."""
+        """Latest motion by the encoders while they determine the pose; else None."""
 
     def observe_encoders(self, reading: WheelEncoders) -> None:
-        """Take the angles of both rear wheels and move the pose along the arc they rolled."""
+        """Add the angles of both rear wheels, and move the pose along their arc."""
         front = self._wheels.front
         increment = self.encoders.observe(reading, (self._front + front) / 2)
         self._front = front
@@ -301,7 +302,7 @@ class RearWheelReckoning(DeadReckoning):
         self._go_on()
 
     def observe_drive(self, *shafts: DriveFeedback) -> None:
-        """Take the position of the motor: it checks the encoders, and replaces them."""
+        """Add the position of the motor, which checks or replaces the encoders."""
         roll = self._wheels.observe_drive(*shafts)
         if self._at is None and self._wheels.known:
             self._at = self._wheels.stamp
@@ -326,7 +327,7 @@ class RearWheelReckoning(DeadReckoning):
         return ("drive",) if self._carrying is None else ("encoders", "drive")
 
     def _go_on(self) -> None:
-        """Move the pose as far as is known."""
+        """Move the pose along all known motions."""
         while self._at is not None and (found := self._next(self._at)) is not None:
             roll, by_encoders = found
             self._kept.append((self._at, self._pose, self._covariance))
@@ -335,7 +336,7 @@ class RearWheelReckoning(DeadReckoning):
             self._carrying = roll if by_encoders else None
 
     def _next(self, at: int) -> tuple[WheelIncrement, bool] | None:
-        """Next motion from ``at`` on, and whether it comes from the encoders; None if none is known."""
+        """Return the next motion from ``at`` on, and whether the encoders measured it; None if unknown."""
         until: int | None = None
         if self._heard() and any(self.encoders.believed):
             increment = next((increment for increment in self._increments if increment.stamp > at), None)
@@ -352,18 +353,18 @@ class RearWheelReckoning(DeadReckoning):
         return _part(driven, at, driven.stamp if until is None else min(until, driven.stamp)), False
 
     def _heard(self) -> bool:
-        """Whether the encoders are as fresh as the motor."""
+        """Whether the encoders' readings are as recent as the motor's."""
         newest = self.encoders.stamp
         return newest is not None and self._wheels.stamp - newest <= LATE
 
     def _by_encoders(self, increment: EncoderIncrement) -> WheelIncrement | None:
-        """Motion by the trusted wheels; None if they did not measure it."""
+        """Return the motion by the trusted wheels; None if they did not measure it."""
         dt, lean = (increment.stamp - increment.since) / SECOND, self._tricycle.lean(increment.front)
         left, right = increment.distances[0] / dt, increment.distances[1] / dt
         trusted = self.encoders.believed
         if not all(trusted):
             speed, share = (left, 1.0 - lean) if trusted[0] else (right, 1.0 + lean)
-            # 0.3: share of the axle's speed below which a wheel does not determine it: the robot turns about that wheel
+            # 0.3: share of the axle's speed below which a wheel is not used alone: the robot turns about that wheel
             if abs(share) < 0.3:
                 return None
             left, right = speed / share * (1.0 - lean), speed / share * (1.0 + lean)
@@ -372,7 +373,7 @@ class RearWheelReckoning(DeadReckoning):
         return WheelIncrement(increment.since, increment.stamp, twist, rolled, (twist[0],), (increment.front, 0.0))
 
     def _take_back(self, since: int) -> None:
-        """Return to the pose at that instant, ns, or to the oldest one that is kept."""
+        """Return to the pose at an instant (ns), or to the oldest stored pose."""
         for stamp, pose, covariance in self._kept:
             if stamp >= since:
                 self._at, self._pose, self._covariance = stamp, pose, covariance
@@ -384,19 +385,19 @@ class RearWheelReckoning(DeadReckoning):
 
 
 def _part(roll: WheelIncrement, since: int, stamp: int) -> WheelIncrement:
-    """The part of a motion from ``since`` (or its beginning) to ``stamp``; one that is not known stays whole."""
+    """Return the part of a motion from ``since`` (or its start) to ``stamp``; an unknown motion is not divided."""
     since = max(since, roll.since)
     share = (stamp - since) / (roll.stamp - roll.since)
     return replace(roll, since=since, stamp=stamp, distance=roll.distance * share)
 
 
 class EncoderInput:
-    """Feeds readings of the bus to a ``RearWheelReckoning``; reports when encoders and driven wheel disagree.
+    """Pass encoder messages to a ``RearWheelReckoning``, and report disagreement with the driven wheel.
 
     Args:
         reckoning: the estimator.
-        measured: readings.
-        events: where a disagreement is reported.
+        measured: encoder readings.
+        events: sink of the reports.
         source: source of the events.
     """
 
@@ -410,12 +411,12 @@ class EncoderInput:
         self._reported = EncoderVerdict()
 
     def take(self) -> None:
-        """Pass new readings on."""
+        """Pass new readings to the estimator."""
         for reading in self._measured.drain():
             self._reckoning.observe_encoders(reading)
 
     def report(self) -> None:
-        """Report another verdict."""
+        """Report a changed verdict."""
         now, reported = self._reckoning.encoders.verdict, self._reported
         if now is reported:
             return
@@ -435,7 +436,7 @@ class EncoderInput:
 
 
 def build_rear_wheels(config: RearWheelConfig, context: OdometryContext) -> OdometryService:
-    """The service with its topics, for the catalog.
+    """Build the service with its topics, for the catalog.
 
     Raises:
         InputError: the body has no rear wheels with encoders.
@@ -444,7 +445,7 @@ def build_rear_wheels(config: RearWheelConfig, context: OdometryContext) -> Odom
         raise InputError("odometry.kind encoders: expected body tricycle and the device encoders")
     imu = context.inertial(config.gyro)
     reckoning = RearWheelReckoning(config, context.chassis, None if imu is None else imu.inertial)
-    measured = context.bus.subscribe(topics.ENCODERS, fifo(32))  # readings queued at most
+    measured = context.bus.subscribe(topics.ENCODERS, fifo(32))  # maximum number of queued readings
     events = context.bus.event_sink()
     encoders = EncoderInput(reckoning, measured, events, OdometryService.name)
     return OdometryService(

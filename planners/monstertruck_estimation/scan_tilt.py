@@ -1,8 +1,9 @@
-"""How far a scan's plane was from the horizontal: the body's tilt composed with the joints of the lidar's mount.
+"""Tilt of a scan's plane: the body's tilt composed with the joints of the lidar's mount.
 
-Body R = Ry(pitch) Rx(roll) in a level frame, mount M = Ry(a) Rx(b) on the body: the plane's normal is R M z, and the
-tilt is its angle to the vertical, acos(u . M z) with u = R^T z = (-sin p, sin r cos p, cos r cos p) the body's view of
-up. Compass and joints are read at other instants than scans, so both are interpolated to the middle of the scan.
+With the body's rotation R = Ry(pitch) Rx(roll) in a level frame and the mount's M = Ry(a) Rx(b) on the body, the
+plane's normal is R M z. Its tilt is the angle to the vertical, acos(u . M z), with the vertical in the body's axes u =
+R^T z = (-sin p, sin r cos p, cos r cos p). Compass and joints have other stamps than scans, so both are interpolated to
+the middle of the scan.
 """
 
 import math
@@ -19,13 +20,13 @@ from monstertruck_schemas.sensor import Attitude, LaserScan, StabiliserFeedback
 from monstertruck_schemas.state import Odometry
 
 NO_TILT: Final = math.pi / 2
-"""Tilt of a scan whose mount or body angles are unknown, so that it is not used."""
+"""Tilt of a scan with unknown mount or body angles, which rules out its use."""
 
 Angles = tuple[float, float]
 
 
 def plane_tilt(roll: float, pitch: float, joint_pitch: float = 0.0, joint_roll: float = 0.0) -> float:
-    """Angle between the lidar's plane and the horizontal, rad; arguments in rad, REP 103."""
+    """Return the angle between the lidar's plane and the horizontal (rad); arguments in rad, REP 103."""
     x, y = math.sin(joint_pitch) * math.cos(joint_roll), -math.sin(joint_roll)
     z = math.cos(joint_pitch) * math.cos(joint_roll)
     up = -math.sin(pitch) * x + math.cos(pitch) * (math.sin(roll) * y + math.cos(roll) * z)
@@ -35,9 +36,9 @@ def plane_tilt(roll: float, pitch: float, joint_pitch: float = 0.0, joint_roll: 
 def plane_slopes(
     roll: float, pitch: float, joint_pitch: float = 0.0, joint_roll: float = 0.0, yaw: float = 0.0
 ) -> tuple[float, float]:
-    """Rise per metre along the x and y axis of a lidar mounted at ``yaw``; the other arguments as in ``plane_tilt``.
+    """Return the rise per metre along the axes of a lidar at ``yaw``; the other arguments as in ``plane_tilt``.
 
-    The columns of M = Ry(a) Rx(b) Rz(yaw), seen along the body's view of up.
+    The slopes follow from the columns of M = Ry(a) Rx(b) Rz(yaw) and the vertical in the body's axes.
     """
     up = -math.sin(pitch), math.sin(roll) * math.cos(pitch), math.cos(roll) * math.cos(pitch)
     ca, sa, cb, sb = math.cos(joint_pitch), math.sin(joint_pitch), math.cos(joint_roll), math.sin(joint_roll)
@@ -47,18 +48,18 @@ def plane_slopes(
 
 
 class AngleHistory:
-    """Recent values of two angles, read at any instant between and shortly after them."""
+    """Recent readings of two angles, interpolated between them and extrapolated shortly beyond."""
 
     def __init__(self) -> None:
         self._points: deque[tuple[int, Angles]] = deque(maxlen=16)
 
     def extend(self, points: Iterable[tuple[int, Angles]]) -> None:
-        """Take newer readings: stamp, ns, and angles."""
+        """Add later readings: stamp (ns) and angles."""
         self._points.extend(points)
 
     def at(self, time_ns: int) -> Angles | None:
         """Interpolate between the two readings around ``time_ns``, or extrapolate the latest two; None if unknown."""
-        stale = SECOND // 4  # nanoseconds that angles are extended beyond the latest reading
+        stale = SECOND // 4  # maximum extrapolation beyond the latest reading, ns
         if not self._points or time_ns - self._points[-1][0] > stale:
             return None
         if len(self._points) == 1:
@@ -72,12 +73,12 @@ class AngleHistory:
 
 
 class ScanAngles:
-    """Angles of body and mount when a scan was taken.
+    """Angles of body and mount at the time of a scan.
 
     Args:
-        compass: the body's tilt.
+        compass: tilt of the body.
         joints: joints of the mount; None if the lidar is fixed to the body.
-        odometry: gives the body's acceleration to correct its tilt; None for no correction.
+        odometry: gives the body's acceleration for the correction of its tilt; None for no correction.
     """
 
     def __init__(
@@ -115,10 +116,10 @@ class ScanAngles:
 
 
 class TiltStamper:
-    """Publisher of scans that adds their ``tilt``.
+    """Publisher that adds the ``tilt`` to each scan.
 
     Args:
-        out: where scans go.
+        out: publisher of the scans.
         angles: angles of body and mount.
     """
 
@@ -127,11 +128,11 @@ class TiltStamper:
         self._angles = angles
 
     def next_seq(self) -> int:
-        """Sequence number for the next scan."""
+        """Sequence number of the next scan."""
         return self._out.next_seq()
 
     def put(self, message: LaserScan) -> None:
-        """Publish a scan with the tilt its plane had in its middle."""
+        """Publish a scan with the tilt of its plane at half time."""
         angles = self._angles.at(message)
         unknown = NO_TILT if self._angles.jointed else None
         self._out.put(message.model_copy(update={"tilt": unknown if angles is None else plane_tilt(*angles)}))

@@ -1,7 +1,7 @@
-"""The frame tree: angles and quaternions, look-up between any two frames, and the service that publishes it.
+"""Frame tree: angles and quaternions, look-up between any two frames, and the service that publishes it.
 
-map > odom > base > sensors (REP 105). map to odom is the identity until something localises the truck in the map.
-A transform is the pose of ``child`` in ``parent``.
+map > odom > base > sensors (REP 105). The transform from map to odom is the identity unless the truck is localised. A
+transform is the pose of ``child`` in ``parent``.
 """
 
 import math
@@ -25,12 +25,12 @@ FIXED: Final = 0
 
 
 def wrap_angle(angle: float) -> float:
-    """The same angle in [-pi, pi], rad."""
+    """Return the angle wrapped to [-pi, pi] (rad)."""
     return math.remainder(angle, math.tau)
 
 
 def quaternion_from_rpy(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """Unit quaternion (x, y, z, w) of turning about x, then y, then z of the parent frame (REP 103), rad."""
+    """Return the unit quaternion (x, y, z, w) of turns about x, then y, then z of the parent frame (REP 103, rad)."""
     cr, sr = math.cos(roll / 2), math.sin(roll / 2)
     cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
     cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
@@ -43,18 +43,18 @@ def quaternion_from_rpy(roll: float, pitch: float, yaw: float) -> Quaternion:
 
 
 def quaternion_from_yaw(yaw: float) -> Quaternion:
-    """Unit quaternion of a turn about z, rad."""
+    """Return the unit quaternion of a turn about z (rad)."""
     return 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)
 
 
 def yaw_of(rotation: Quaternion) -> float:
-    """Yaw, rad, of a unit quaternion."""
+    """Return the yaw of a unit quaternion (rad)."""
     x, y, z, w = rotation
     return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
-    """Rotation ``b`` followed by rotation ``a`` (both in the parent frame)."""
+    """Return rotation ``b`` followed by rotation ``a``, both in the parent frame."""
     ax, ay, az, aw = a
     bx, by, bz, bw = b
     return (
@@ -66,19 +66,19 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
 
 
 def conjugate(rotation: Quaternion) -> Quaternion:
-    """The opposite rotation."""
+    """Return the inverse rotation."""
     x, y, z, w = rotation
     return -x, -y, -z, w
 
 
 def rotate(rotation: Quaternion, vector: Xyz) -> Xyz:
-    """Vector of the child frame in the parent frame."""
+    """Rotate a vector from the child frame to the parent frame."""
     x, y, z, _ = multiply(multiply(rotation, (*vector, 0.0)), conjugate(rotation))
     return x, y, z
 
 
 def compose(outer: Transform, inner: Transform) -> Transform:
-    """Pose of ``inner.child`` in ``outer.parent``; as old as the older of the two that is not ``FIXED``."""
+    """Return the pose of ``inner.child`` in ``outer.parent``, with the older stamp that is not ``FIXED``."""
     shifted = rotate(outer.rotation, inner.translation)
     return Transform(
         parent=outer.parent,
@@ -90,7 +90,7 @@ def compose(outer: Transform, inner: Transform) -> Transform:
 
 
 def invert(transform: Transform) -> Transform:
-    """Pose of the parent in the child."""
+    """Return the pose of the parent in the child."""
     back = conjugate(transform.rotation)
     x, y, z = rotate(back, transform.translation)
     return Transform(
@@ -103,12 +103,12 @@ def invert(transform: Transform) -> Transform:
 
 
 def mount(child: str, position: Xyz, rpy: Xyz = (0.0, 0.0, 0.0), parent: str = "base") -> Transform:
-    """Fixed pose of a sensor: position in m, roll, pitch, yaw in rad."""
+    """Return the fixed pose of a sensor: position (m), and roll, pitch, yaw (rad)."""
     return Transform(parent=parent, child=child, stamp=FIXED, translation=position, rotation=quaternion_from_rpy(*rpy))
 
 
 def planar(parent: str, child: str, stamp: int, pose: Xyz) -> Transform:
-    """Transform of a planar pose (x, y, yaw)."""
+    """Return the transform of a planar pose (x, y, yaw)."""
     x, y, yaw = pose
     return Transform(
         parent=parent, child=child, stamp=stamp, translation=(x, y, 0.0), rotation=quaternion_from_yaw(yaw)
@@ -116,21 +116,21 @@ def planar(parent: str, child: str, stamp: int, pose: Xyz) -> Transform:
 
 
 def planar_pose(transform: Transform) -> Xyz:
-    """x, y (m) and yaw (rad) of a transform, seen from above."""
+    """Return x, y (m) and yaw (rad) of a transform, projected on the ground."""
     x, y, _ = transform.translation
     return x, y, yaw_of(transform.rotation)
 
 
 def added(a: Xyz, b: Xyz) -> Xyz:
-    """Sum of two vectors."""
+    """Return the sum of two vectors."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 class FrameTree:
-    """Transforms between neighbouring frames, and between any two of them.
+    """Transforms between neighbouring frames, with look-up between any two frames.
 
     Args:
-        transforms: to begin with.
+        transforms: initial transforms.
     """
 
     def __init__(self, transforms: Iterable[Transform] = ()) -> None:
@@ -139,10 +139,10 @@ class FrameTree:
             self.put(transform)
 
     def put(self, transform: Transform) -> None:
-        """Add or renew the pose of a frame in its parent.
+        """Add or update the pose of a frame in its parent.
 
         Raises:
-            InputError: the frame has another parent already, or would be its own ancestor.
+            InputError: the frame already has another parent, or would be its own ancestor.
         """
         child, parent = transform.child, transform.parent
         known = self._by_child.get(child)
@@ -155,10 +155,10 @@ class FrameTree:
         self._by_child[child] = transform
 
     def lookup(self, parent: str, child: str) -> Transform:
-        """Pose of ``child`` in ``parent``, over any chain of frames between them.
+        """Return the pose of ``child`` in ``parent``, over any chain of frames between them.
 
         Raises:
-            NotFoundError: no such frame, or nothing connects the two.
+            NotFoundError: a frame does not exist, or the two are not connected.
         """
         known = {*self._by_child, *(transform.parent for transform in self._by_child.values())}
         there = self._ancestors(parent)
@@ -169,21 +169,21 @@ class FrameTree:
         return compose(invert(self._chain(parent, shared)), self._chain(child, shared))
 
     def all(self, now: int) -> tuple[Transform, ...]:
-        """All transforms, the latest of each frame; fixed ones are valid ``now``."""
+        """Return the latest transform of each frame; fixed ones are stamped ``now``."""
         return tuple(
             transform.model_copy(update={"stamp": now}) if transform.stamp == FIXED else transform
             for transform in self._by_child.values()
         )
 
     def _ancestors(self, frame: str) -> list[str]:
-        """The frame and everything it hangs on."""
+        """Return the frame and its ancestors."""
         line = [frame]
         while (above := self._by_child.get(line[-1])) is not None:
             line.append(above.parent)
         return line
 
     def _chain(self, frame: str, ancestor: str) -> Transform:
-        """Pose of ``frame`` in its ``ancestor``."""
+        """Return the pose of ``frame`` in its ``ancestor``."""
         pose = Transform(parent=frame, child=frame, stamp=FIXED, translation=(0.0, 0.0, 0.0), rotation=IDENTITY)
         while frame != ancestor:
             step = self._by_child[frame]
@@ -192,17 +192,17 @@ class FrameTree:
 
 
 class TransformService:
-    """Publishes the whole frame tree.
+    """Publish the whole frame tree.
 
     Args:
         mounts: fixed poses of the sensors, see ``mount``.
-        clock: time.
+        clock: the service's clock.
         odometry: pose of base in odom.
-        out: where the tree goes.
-        rate: messages per second.
-        joints: of a stabiliser: the pose of the point its two joints turn about, and their angles. Frames that it
-            carries have it as parent; until the angles are known it is assumed level.
-        localised: transforms above base by localisation, which replace odometry and the fixed map to odom.
+        out: publisher of the tree.
+        rate: publishing rate (1/s).
+        joints: joints of a stabiliser: the pose of the point about which both turn, and their angles. Frames on the
+            stabiliser have it as parent; while the angles are unknown, it is assumed level.
+        localised: transforms above base from localisation, which replace odometry and the fixed map to odom.
     """
 
     name = ServiceName.TRANSFORMS.value

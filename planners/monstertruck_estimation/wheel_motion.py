@@ -1,7 +1,7 @@
-"""Motion of base by the wheels between two readings, of any drive family, with its covariance.
+"""Motion of base from the wheels between two readings, for any drive family, with its covariance.
 
-The covariance comes from the family's own kinematics: the noise of every driven shaft and of both axle angles goes
-through the derivatives of the body's twist, and unmeasured motion (sideways slip, scrubbing) is added to it.
+The covariance comes from the family's own kinematics: the noise of every driven shaft and of both axle angles is
+propagated through the derivatives of the body's twist, and unmeasured motion (sideways slip, scrubbing) is added.
 """
 
 import math
@@ -21,32 +21,32 @@ class WheelIncrement:
     """Motion of base between two readings of all driven shafts."""
 
     since: int
-    """ns."""
+    """Stamp of the earlier reading (ns)."""
     stamp: int
-    """ns."""
+    """Stamp of the later reading (ns)."""
     twist: Twist2
-    """Mean vx, vy (m/s) and wz (rad/s) in between."""
+    """Mean vx, vy (m/s) and wz (rad/s) between both."""
     distance: float
-    """Travelled by the fastest shaft, m, not negative."""
+    """Distance of the fastest shaft, not negative (m)."""
     pace: Speeds
     """Speeds of the family's inputs, see ``Chassis.input_speeds``."""
     angles: Angles
-    """Mean steering angles, rad."""
+    """Mean steering angles (rad)."""
     lost: bool = False
-    """The drive's counter has a new origin: the motion is not known, and the twist is 0."""
+    """Whether the drive's counter has a new origin: the motion is then unknown, and the twist is 0."""
 
     @property
     def dt(self) -> float:
-        """Seconds."""
+        """Duration (s)."""
         return (self.stamp - self.since) / SECOND
 
 
 class WheelMotion:
-    """Turns drive and steering feedback into the base's motion.
+    """Convert drive and steering feedback to the base's motion.
 
     Args:
-        chassis: from motors and servos to the body's motion.
-        max_speed: a position that would need more than this, m/s, is a new origin, not a motion.
+        chassis: maps motors and servos to the body's motion.
+        max_speed: maximum speed between two positions (m/s); beyond it, the counter has a new origin.
     """
 
     def __init__(self, chassis: Chassis, max_speed: float) -> None:
@@ -57,9 +57,9 @@ class WheelMotion:
         self._angles_then = chassis.straight
         self._pace: Speeds = (0.0,) * len(chassis.shafts)
         self.stamp = 0
-        """Stamp of the latest reading used, ns."""
+        """Stamp of the latest reading used (ns)."""
         self.steered: int | None = None
-        """Stamp of the latest servo angles, ns."""
+        """Stamp of the latest servo angles (ns)."""
 
     @property
     def known(self) -> bool:
@@ -68,26 +68,26 @@ class WheelMotion:
 
     @property
     def front(self) -> float:
-        """Latest angle of the front axle, rad."""
+        """Latest angle of the front axle (rad)."""
         return self._angles[0]
 
     @property
     def twist(self) -> Twist2:
-        """Velocity (vx, vy, wz) at the latest speed and steering angles; m/s, rad/s."""
+        """Velocity (vx, vy, wz) at the latest speed and steering angles (m/s, rad/s)."""
         return self._chassis.twist(self._pace, *self._angles)
 
     def observe_steering(self, feedback: SteeringFeedback) -> None:
-        """Take the servo angles being sent, unless the servo controller marks them untrusted."""
+        """Add the commanded servo angles, unless the servo controller marks them untrusted."""
         if not feedback.trusted or not all(map(math.isfinite, feedback.servos)):
             return
         self._angles = self._chassis.steering(*feedback.servos)
         self.steered = feedback.stamp
 
     def observe_drive(self, *shafts: DriveFeedback) -> WheelIncrement | None:
-        """Motion since the last reading; None for the first, one that is not later, or one that is not a number.
+        """Return the motion since the last reading; None for the first reading, an earlier one, or NaN.
 
-        Positions that were not read simultaneously are extrapolated to the latest by their speeds; the next readings
-        correct the error.
+        Positions that were read at different times are extrapolated to the latest stamp with their speeds; the next
+        readings correct the error.
         """
         stamp = max(shaft.stamp for shaft in shafts)
         turns = tuple(shaft.position + shaft.velocity * ((stamp - shaft.stamp) / SECOND) for shaft in shafts)
@@ -112,15 +112,15 @@ class WheelMotion:
 def increment_covariance(
     chassis: Chassis, roll: WheelIncrement, shaft: float, angle: float, slip: tuple[float, float, float]
 ) -> Array:
-    """Covariance of the motion (dx, dy, dyaw) of ``roll`` in base, shape (3, 3); m and rad.
+    """Return the covariance of the motion (dx, dy, dyaw) of ``roll`` in base, shape (3, 3) (m, rad).
 
     It grows with the distance, not with the number of readings.
 
     Args:
-        chassis: the body.
+        chassis: the robot's chassis.
         roll: motion of the wheels.
-        shaft: standard deviation of every shaft's distance per root metre it rolled, m.
-        angle: standard deviation of the mean of every steering angle over one metre, rad.
+        shaft: standard deviation of every shaft's distance per root metre rolled (m).
+        angle: standard deviation of the mean of every steering angle over one metre (rad).
         slip: standard deviations of motion that the wheels do not measure, forward and sideways (m) and in yaw (rad),
             per root metre.
     """

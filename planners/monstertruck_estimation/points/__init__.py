@@ -1,1 +1,1 @@
-"""Points of interest: tags that the camera reads, and places that an operator marks, as objects of the map."""
+"""Points of interest on the map: tags read by the camera and places marked by an operator."""

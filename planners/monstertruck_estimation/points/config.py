@@ -21,7 +21,7 @@ class PointsConfig(Schema):
     sizes: dict[Annotated[int, Field(ge=0, le=1023)], Size] = Field(default_factory=dict)
     """Sizes of other tags by number (m)"""
     rate: Annotated[float, Field(gt=0, le=30)] = 5.0
-    """Maximum rate of images read (1/s); a standing robot reads two per place"""
+    """Maximum rate of processed images (1/s); a standing robot reads two images per place"""
     reach: Positive = 2.0
     """Maximum distance of a tag (m): at 3 m a tag of 10 cm has 2 pixels per cell"""
     angle: Annotated[float, Field(gt=0, lt=1.57)] = radians(60.0)

@@ -1,4 +1,4 @@
-"""Inputs and outputs of the image reader; light, as the daemon's loop imports it."""
+"""Inputs and outputs of the image reader; light, for import by the daemon."""
 
 import math
 from dataclasses import dataclass, field
@@ -41,7 +41,7 @@ class ReadTask:
 
 @dataclass(frozen=True, slots=True)
 class TagReading:
-    """Tag as seen in an image, in the camera's axes: right, down, ahead."""
+    """A tag's pose from one image, in the camera's axes: right, down, ahead."""
 
     tag: int
     middle: Triple
@@ -49,9 +49,9 @@ class TagReading:
     normal: Triple
     """Unit vector out of the tag's front."""
     other_normal: Triple
-    """Normal of the second pose that fits the outline."""
+    """Normal of the second pose that fits the outline as well."""
     doubt: float
-    """Fit of the second pose, from 0 (does not fit) to 1 (fits equally well, and the heading is meaningless)."""
+    """Fit of the second pose, from 0 (does not fit) to 1 (fits equally well: the heading is ambiguous)."""
     pixels: float
     """Mean side of the black square (pixels)."""
     margin: float
@@ -59,7 +59,7 @@ class TagReading:
     angle: float
     """Angle from the tag's normal to the camera (rad)."""
     spread: tuple[float, ...]
-    """Covariance of centre and normal, row-major (6, 6), by the corners alone."""
+    """Covariance of centre and normal from the corners alone, row-major (6, 6)."""
     picture: bytes = b""
     """JPEG of the tag and its surroundings."""
 
@@ -70,14 +70,14 @@ class ReadAnswer:
 
     readings: tuple[TagReading, ...] = ()
     unreadable: bool = False
-    """The data are not an image."""
+    """Whether the data are not an image."""
 
 
 def tag_pose(reading: TagReading, mount: Mount) -> TagPose:
     """Return the pose of a tag in base, for a camera at ``mount``.
 
-    The covariance is that of the corners in the image. If the second pose of the square fits as well, half its
-    difference in yaw counts as a standard deviation, too: which one is right is unknown.
+    The covariance comes from the noise of the corners in the image. If the second pose of the square fits as well, half
+    the difference in yaw is added as a standard deviation: the choice between the two poses is uncertain.
     """
     turned = camera_axes(mount.yaw, mount.pitch, mount.roll)
     x, y, z = turned @ np.array(reading.middle) + np.array((mount.x, mount.y, mount.z))

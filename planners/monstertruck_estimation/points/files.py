@@ -30,7 +30,7 @@ def save(folder: Path, points: list[tuple[PointOfInterest, bytes]], run: str | N
     Args:
         folder: folder of the map.
         points: points with their images (JPEG); may be empty.
-        run: run that makes the map; None if they belong to the existing map.
+        run: run that makes the map; None for points of an existing map.
 
     Raises:
         OSError: a file could not be written.
@@ -64,7 +64,7 @@ def _read(file: Path) -> list[PointOfInterest]:
             raise InputError(f"{file}: {point.name}: expected unique names")
         if max(map(abs, (point.x, point.y, point.z, point.yaw))) > MAX_COORDINATE:
             raise InputError(f"{file}: {point.name}: expected at most {MAX_COORDINATE:g} m and rad")
-        least, most = 1e-12, 1e12  # variance of any direction, m^2 or rad^2
+        least, most = 1e-12, 1e12  # variance in each direction, m^2 or rad^2
         if not _is_covariance(np.reshape(point.covariance, (3, 3)), least, most):
             text = f"expected a symmetric matrix of variances from {least:g} to {most:g}"
             raise InputError(f"{file}: {point.name}: covariance: {text}")

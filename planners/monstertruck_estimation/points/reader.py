@@ -1,9 +1,9 @@
-"""Reading step for workers: takes an image, returns tags with their places relative to the camera. Loads OpenCV.
+"""Worker step that reads images and returns tags with their poses relative to the camera. Loads OpenCV.
 
-The pose of a tag is its square's (Collins and Bartoli, "Infinitesimal plane-based pose estimation", IJCV 2014;
-in OpenCV ``SOLVEPNP_IPPE_SQUARE``). It has two solutions: from afar, a small square turned to either side looks the
-same. Both are refined to the minimum of the reprojection error before they are compared: unrefined, the slant of a tag
-seen from its front scatters about nine times as much.
+A tag's pose is the pose of its square (Collins and Bartoli, "Infinitesimal plane-based pose estimation", IJCV 2014; in
+OpenCV ``SOLVEPNP_IPPE_SQUARE``). The problem has two solutions: a small distant square looks the same when turned to
+either side. Both are refined to the minimum reprojection error before their comparison: unrefined, the slant of a tag
+seen from the front scatters about nine times as much.
 """
 
 from dataclasses import replace
@@ -20,7 +20,7 @@ from monstertruck_schemas.board import TagFamily
 
 
 class ReadingStep:
-    """Read images one by one; keeps the reader of the last family."""
+    """Read images one by one; the detector of the last tag family is reused."""
 
     def __init__(self) -> None:
         self._family: TagFamily = "36h11"
@@ -70,7 +70,7 @@ CORNER_DEVIATION: Final = 0.25
 
 
 class _Fit(NamedTuple):
-    """A pose of a tag that fits its corners."""
+    """Candidate pose of a tag that fits its corners."""
 
     turn: Array
     """Rotation vector (3,)."""
@@ -98,7 +98,7 @@ def placed(sighting: Sighting, size: float, lens: Lens, margin: float) -> TagRea
     if not fits:
         return None
     best, other = fits[0], fits[-1]
-    alone = bool(np.allclose(best.turn, other.turn, atol=1e-3))  # both were refined to the same pose
+    alone = bool(np.allclose(best.turn, other.turn, atol=1e-3))  # both converged to the same pose
     doubt = 0.0 if alone else (best.error + CORNER_DEVIATION) / (other.error + CORNER_DEVIATION)
     normal, spread = _normal(best)
     away = best.place / np.linalg.norm(best.place)
@@ -130,13 +130,13 @@ def _normal(fit: _Fit) -> tuple[Array, Array]:
     turned, slopes = cv2.Rodrigues(fit.turn)
     by_pose = np.zeros((6, 6))
     by_pose[:3, 3:] = np.eye(3)
-    by_pose[3:, :3] = slopes.T.reshape(3, 3, 3)[:, 2]  # OpenCV: row i is the derivative by the vector's part i
+    by_pose[3:, :3] = slopes.T.reshape(3, 3, 3)[:, 2]  # OpenCV: row i is the derivative by component i of the vector
     pose = np.linalg.pinv(fit.jacobian.T @ fit.jacobian) * CORNER_DEVIATION**2
     return np.asarray(turned)[:, 2], by_pose @ pose @ by_pose.T
 
 
 def _with_picture(reading: TagReading, colour: Array, sighting: Sighting) -> TagReading:
-    margin = 0.6 * sighting.size  # margin of a tag's image on each side, in sides of the tag
+    margin = 0.6 * sighting.size  # margin around a tag's image on each side, in tag sides
     low, high = sighting.corners.min(axis=0) - margin, sighting.corners.max(axis=0) + margin
     x0, y0 = np.maximum(low, 0).astype(int)
     x1, y1 = np.minimum(np.ceil(high), (colour.shape[1], colour.shape[0])).astype(int)

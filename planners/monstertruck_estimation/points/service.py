@@ -1,7 +1,7 @@
-"""Points of interest service: passes images to the reading worker, and turns readings into objects of the map.
+"""Points of interest service: sends images to the reading worker, and turns its readings into map objects.
 
-The poses of the tags in each image are published, too. While the robot docks, every image is read, also of a robot that
-stands or does not know its pose in the map.
+It also publishes the poses of the tags in each image. While the robot docks, it reads every image, even at standstill
+or without a pose in the map.
 """
 
 import asyncio
@@ -48,17 +48,17 @@ OLDEST: Final = SECOND
 PERIOD: Final = SECOND
 """Time between two messages (ns)."""
 OTHERS_PAUSE: Final = 0.02
-"""Pause that lets other tasks run (s)."""
+"""Pause that lets other tasks on the event loop run (s)."""
 
 
 @dataclass(frozen=True, slots=True)
 class PointInputs:
-    """Topics read."""
+    """Topics that the service reads."""
 
     camera: Mailbox[CompressedImage] | None
-    """Camera images; None if places are only marked."""
+    """Camera images; None if only operators mark places."""
     pose: Mailbox[Odometry]
-    """All poses in map."""
+    """All poses of the robot in map."""
     slam: Subscription[SlamHealth] | None
     attitude: Subscription[Attitude] | None
     gate: Subscription[GateState]
@@ -67,13 +67,13 @@ class PointInputs:
 
 @dataclass(frozen=True, slots=True)
 class PointFolders:
-    """Folders of the points."""
+    """Folders for points."""
 
     load: Path | None = None
     """Folder of the map known at the start."""
     save: Path | None = None
     run: str | None = None
-    """Run that makes the map; None if the map is known."""
+    """Run that makes the map; None for a known map."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,21 +85,21 @@ class _Placed:
 
 
 class PointService:
-    """Find tags in the camera's images, and keep them and the operators' marks in the map.
+    """Find tags in the camera's images, and keep them and the operators' marks on the map.
 
     Args:
         config: gates and rates.
         camera: mount and lens; None without a camera.
-        clock: time.
-        actor: reads the images.
+        clock: the service's clock.
+        actor: runs the image reader.
         inputs: topics read.
-        ask: returns the robot's past poses; None if the map does not move.
-        out: ``state/points``.
-        tags: ``state/tags``.
-        events: receives finds and failures.
+        ask: returns past poses of the robot; None if the map never moves.
+        out: publisher of ``state/points``.
+        tags: publisher of ``state/tags``.
+        events: sink of finds and failures.
         folders: folders of the map.
-        save_map: requests that this run's map is saved as soon as possible; None if the map is known.
-        offload: runs the reading and writing of files.
+        save_map: requests a save of this run's map as soon as possible; None for a known map.
+        offload: runs file access outside the event loop.
         max_age: see ``GateConfig.max_request_age``.
     """
 
@@ -128,21 +128,21 @@ class PointService:
         self._ask, self._out, self._events, self._folders = ask, out, events, folders
         self._save_map, self._offload = save_map, offload
         self._map_saved = False
-        """Whether the map of this run was saved."""
+        """Whether the map of this run has been saved."""
         self._map = PointMap(config, mount)
         self._sequences = Sequences(max_age)
-        self._history: deque[_Placed] = deque(maxlen=128)  # poses kept: 2.5 s at 50 Hz
+        self._history: deque[_Placed] = deque(maxlen=128)  # maximum number of stored poses: 2.5 s at 50 Hz
         self._trail: deque[tuple[int, Pose2]] = deque(maxlen=4000)
         self._stamps: tuple[int, ...] = ()
         self._bases: Bases = {}
         self._dirty: dict[str, None] = {}
         self._published = self._unsaved = False
         self._looked: tuple[Pose2, int] | None = None
-        """Place of the last images read, and their number."""
+        """Place of the last images and their number."""
         self._unreadable = False
         self._writing = asyncio.Lock()
         self._unanchored: dict[str, int] = {}
-        """Instants of marks whose place in the map is known, but not yet the robot's pose then in the current map."""
+        """Stamps of marks with a place in the map, but without the robot's pose then in the current map."""
 
     async def run(self, ready: Ready) -> None:
         """Serve until cancelled, then save."""
@@ -176,7 +176,7 @@ class PointService:
                 answer: ReadAnswer = await actor.step(ReadTask.of(picture.data, self._lens, self._config))
             except WorkerError as error:
                 self._events(error.reason, Severity.ERROR, self.name, str(error))
-                await self._clock.sleep(2.0)  # pause before a failed worker is tried again (s)
+                await self._clock.sleep(2.0)  # pause before a failed worker restarts, s
                 continue
             self._publish_tags(answer, picture)
             if useful and placed is not None:
@@ -209,7 +209,7 @@ class PointService:
 
     async def _placed(self, stamp: int) -> _Placed | None:
         """Return the robot's pose at an instant; None if unknown."""
-        limit = self._clock.now() + (SECOND // 10)  # maximum wait of an image for a pose as recent, ns
+        limit = self._clock.now() + (SECOND // 10)  # maximum wait of an image for a pose at its stamp, ns
         self._gather()
         while (not self._history or self._history[-1].stamp < stamp) and self._clock.now() < limit:
             await self._clock.sleep(OTHERS_PAUSE)
@@ -233,7 +233,7 @@ class PointService:
                 self._history.clear()
             covariance = message.pose_covariance.reshape(3, 3)
             self._history.append(_Placed(message.stamp, pose, covariance, message.twist.wz))
-            # 0.5: metres between two places remembered for marks
+            # 0.5: distance between stored places for marks, m
             if not self._trail or math.dist(self._trail[-1][1][:2], pose[:2]) >= 0.5:
                 self._trail.append((message.stamp, pose))
 
@@ -248,22 +248,22 @@ class PointService:
         ) <= self._config.tilt  # fmt: skip
 
     def _worth(self, pose: Pose2) -> bool:
-        """Whether the robot has moved since the last images, or has looked here only once."""
-        # a robot that has moved and turned less (m, rad) is still at the place of the last image
+        """Whether the robot has moved since the last images, or has read only one here."""
+        # maximum motion (m, rad) of a robot still at the place of the last image
         standing = (0.02, 0.02)
         if self._looked is not None:
             before, looks = self._looked
             turned = abs(math.remainder(pose[2] - before[2], math.tau))
             if math.dist(before[:2], pose[:2]) < standing[0] and turned < standing[1]:
                 self._looked = before, looks + 1
-                return looks < 2  # images read at one place
+                return looks < 2  # number of images per place
         self._looked = pose, 1
         return True
 
     # Storage
 
     async def _keep(self) -> None:
-        schedule = Schedule(self._clock, 2.0)  # checks for changes per second
+        schedule = Schedule(self._clock, 2.0)  # checks for changes, 1/s
         now = self._clock.now()
         published, saved = now - PERIOD, now
         while True:
@@ -275,13 +275,13 @@ class PointService:
             if not self._published and now - published >= PERIOD:
                 published, self._published = now, True
                 self._publish(now)
-            if self._unsaved and now - saved >= 10 * SECOND:  # time between two writes of the file, ns
+            if self._unsaved and now - saved >= 10 * SECOND:  # interval between writes of the file, ns
                 saved, self._unsaved = now, False
                 if await self._save() is not Reason.OK:
                     self._unsaved = True
 
     def _correct(self) -> None:
-        """Move the points by the mapper's corrections."""
+        """Move the points according to the mapper's corrections."""
         if self._ask is None or not self._stamps:
             return
         bases = self._ask(self._stamps)
@@ -299,7 +299,7 @@ class PointService:
     async def _refresh(self) -> None:
         dirty, self._dirty = list(self._dirty), {}
         for i, name in enumerate(dirty):
-            if i and i % 4 == 0:  # number of points computed before other tasks run
+            if i and i % 4 == 0:  # number of computed points before other tasks run
                 await self._clock.sleep(OTHERS_PAUSE)
             self._map.refresh(name, self._bases)
         if dirty:
@@ -340,10 +340,10 @@ class PointService:
     # Requests
 
     async def kept(self) -> None:
-        """Save the current points, as an answered request has to outlast a power cut, with the map that it belongs to.
+        """Save the current points with their map: an answered request must survive a power cut.
 
         Raises:
-            RequestRefusedError: it cannot be written, or the map is not saved in time; it is tried again.
+            RequestRefusedError: the points cannot be written, or the map is not saved in time; the service tries again.
         """
         await self._refresh()
         reason = await self._save()
@@ -354,17 +354,17 @@ class PointService:
         await self._require_map()
 
     async def _require_map(self) -> None:
-        """Have the map of this run saved if it was not yet: points alone have no place in the map of another run.
+        """Request a save of this run's map unless it is saved: points must not join the map of another run.
 
         Raises:
-            RequestRefusedError: it is not saved in time.
+            RequestRefusedError: the map is not saved in time.
         """
         folder, run = self._folders.save, self._folders.run
         if folder is None or run is None or self._save_map is None or self._map_saved:
             return
         self._save_map()
         try:
-            async with self._clock.deadline(4.0):  # a call ends after 5 s
+            async with self._clock.deadline(4.0):  # maximum duration of a call: 5 s
                 while not await self._offload(lambda: holds_map(folder, run)):
                     await self._clock.sleep(0.1)
         except TimeoutError:
@@ -376,12 +376,12 @@ class PointService:
         """Mark a place, or forget a point.
 
         Returns:
-            The place that was marked: x, y, yaw in map.
+            The marked place: x, y, yaw in map.
 
         Raises:
-            RequestRefusedError: the sender may not, or the robot does not know where it is.
+            RequestRefusedError: the sender lacks permission, or the robot does not know its pose.
             NotFoundError: no point has this name.
-            InputError: half of a place.
+            InputError: the place is incomplete.
         """
         examine(request, self._in.gate.latest, self._sequences, self._clock.now(), None)
         place = None
@@ -420,7 +420,7 @@ class PointService:
             y if request.y is None else request.y,
             yaw if request.yaw is None else math.remainder(request.yaw, math.tau),
         )
-        # A distant place moves with the part of the map near it.
+        # A distant place moves with the nearest part of the map.
         stamp, base = (here.stamp, here.pose) if request.x is None else nearest(self._trail, place)
         self._unanchored.pop(request.name, None)
         if request.x is not None and self._ask is not None and stamp not in self._bases:
@@ -430,10 +430,10 @@ class PointService:
         return place
 
     def picture(self, name: str) -> bytes:
-        """Return the image of a point, JPEG.
+        """Return the image of a point (JPEG).
 
         Raises:
-            NotFoundError: no such point, or it has no image.
+            NotFoundError: the point does not exist, or has no image.
         """
         tracked = self._map.points.get(name)
         if tracked is None or not tracked.picture:
@@ -441,7 +441,7 @@ class PointService:
         return tracked.picture
 
     def register(self, rpc: RpcRegistry) -> None:
-        """Serve ``points``, answered for a mark by its place, and ``point_picture``, which takes a point's ``name``."""
+        """Serve ``points``, which answers a mark with its place, and ``point_picture``, which takes a ``name``."""
 
         async def points(payload: dict[str, Any]) -> dict[str, Any]:
             place = self.take(parse_request(PointRequest, payload))
@@ -457,5 +457,5 @@ class PointService:
 
 
 def _apart(one: Pose2, other: Pose2) -> bool:
-    # 0.001: a correction that moves less, m or rad, moves no point
+    # 0.001: minimum correction (m, rad) that moves a point
     return max(abs(one[0] - other[0]), abs(one[1] - other[1]), abs(math.remainder(one[2] - other[2], math.tau))) > 0.001

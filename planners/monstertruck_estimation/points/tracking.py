@@ -1,7 +1,8 @@
 """Points of interest from tag readings (pure); a point is stored relative to a pose, so it moves with the map.
 
-Every sighting keeps its place in the robot's base and the instant of its image. After every correction, the mapper is
-asked again where the robot was then, so sightings from before and after a loop agree once it is closed.
+Every sighting keeps its place in the robot's base and the stamp of its image. After every correction, the tracker asks
+the mapper for the robot's pose at that stamp, so that sightings from before and after a loop agree once the loop is
+closed.
 """
 
 import math
@@ -26,12 +27,12 @@ KEPT_SIGHTINGS: Final = 24
 
 @dataclass(frozen=True, slots=True)
 class PointSighting:
-    """A point as seen from the robot at one instant."""
+    """A point's pose relative to the robot at one instant."""
 
     stamp: int
     """Stamp of the image (ns)."""
     base: Pose2
-    """Robot in map at that stamp, as known then."""
+    """Robot in map at that stamp, as known at the time."""
     place: Triple
     """Place in base (m)."""
     yaw: float
@@ -39,12 +40,12 @@ class PointSighting:
     spread: tuple[float, ...]
     """Covariance of x, y, yaw in base, row-major (3, 3)."""
     worth: int = 1
-    """Number of sightings that it represents."""
+    """Number of sightings that it stands for."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tracked:
-    """Point, published or not yet."""
+    """A point, published or not."""
 
     name: str
     kind: PointKind
@@ -63,12 +64,12 @@ class Tracked:
 Bases = Mapping[int, Pose2]
 """Poses of the robot by stamp, in the current map."""
 PoseAsker = Callable[[tuple[int, ...]], Bases]
-"""Asks the mapper for the robot's poses at some stamps; returns those known so far."""
+"""Ask the mapper for the robot's poses at several stamps; return those known so far."""
 
 
 @dataclass
 class PointMap:
-    """All points.
+    """All points of a map.
 
     Args:
         config: gates.
@@ -118,7 +119,7 @@ class PointMap:
         return point.count >= needed and (len(point.sightings) == 1 or _consensus(point.sightings, {}, self.config) > 1)
 
     def mark(self, name: str, stamp: int, base: Pose2, place: Pose2, covariance: Array) -> None:
-        """Mark a place by name, as an operator does.
+        """Mark a place by name, on behalf of an operator.
 
         Args:
             name: name of the place; an existing one is moved.
@@ -135,7 +136,7 @@ class PointMap:
         self.points[name] = Tracked(name, PointKind.MARK, None, None, (one,), 0, stamp, stamp)
 
     def anchor(self, name: str, base: Pose2) -> None:
-        """Keep a mark at its place in the map: by the current map the robot was at ``base`` at its instant."""
+        """Keep a mark at its place in the map: in the current map the robot was at ``base`` at the mark's instant."""
         point = self.points[name]
         (old,) = point.sightings
         here = compose(np.array(old.base), np.array((*old.place[:2], old.yaw)))
@@ -146,11 +147,11 @@ class PointMap:
         self.points[name] = replace(point, sightings=(new,))
 
     def stamps(self) -> tuple[int, ...]:
-        """Return the stamps of the poses that are needed."""
+        """Return the stamps at which poses are needed."""
         return tuple(sorted({one.stamp for point in self.points.values() for one in point.sightings}))
 
     def refresh(self, name: str, bases: Bases) -> None:
-        """Update the published state of a point by the current map; about 0.3 ms."""
+        """Update the published state of a point from the current map; about 0.3 ms."""
         tracked = self.points.get(name)
         if tracked is None or not self.is_known(tracked):
             self.shown.pop(name, None)
@@ -162,11 +163,11 @@ class PointMap:
         return [(point, self.points[name].picture) for name, point in self.shown.items() if name in self.points]
 
     def load(self, points: Iterable[tuple[PointOfInterest, bytes]]) -> None:
-        """Take the points of a saved map, with their images."""
+        """Load the points of a saved map with their images."""
         for point, picture in points:
             spread = tuple(float(v) for v in point.covariance)
             place = (point.x, point.y, point.z)
-            # 2: number of sightings that a point of a saved map represents: one that disagrees changes nothing yet
+            # 2: number of sightings that a point of a saved map stands for; a single contrary sighting changes nothing
             one = PointSighting(0, (0.0, 0.0, 0.0), place, point.yaw, spread, worth=2)
             self.points[point.name] = Tracked(
                 point.name, point.kind, point.tag, point.size, (one,), max(point.sightings, self.config.sightings),
@@ -199,14 +200,14 @@ def sighting(
 ) -> PointSighting:
     """Return a reading as a sighting in the robot's base, with its uncertainty.
 
-    Two poses fit a square: the one with the level normal is used, as of a tag that hangs upright. If both normals are
-    level and fit equally well, the heading is uncertain.
+    Two poses fit a square: the one with the level normal is used, because tags usually hang upright. If both normals
+    are level and fit equally well, the heading is uncertain.
     """
     turned = camera_axes(mount.yaw, mount.pitch, mount.roll)
     place = turned @ np.array(reading.middle) + np.array((mount.x, mount.y, mount.z))
     normals = [turned @ np.array(normal) for normal in (reading.normal, reading.other_normal)]
     level = [abs(float(normal[2])) for normal in normals]
-    doubted = 0.6  # maximum ratio of the fits of the best and the second pose for an unambiguous tag
+    doubted = 0.6  # maximum ratio of the second pose's fit to the best one's for an unambiguous tag
     second = reading.doubt > doubted and level[1] < level[0] - 0.1
     normal = normals[1 if second else 0]
     sure = reading.doubt <= doubted or abs(level[0] - level[1]) > 0.1
@@ -236,8 +237,8 @@ def sighting(
 def fused(sightings: Sequence[PointSighting], bases: Bases, config: PointsConfig) -> tuple[Array, float, Array]:
     """Return pose (x, y, yaw) and height of the sightings that agree, and the pose's covariance, (3, 3).
 
-    The sightings from one place share its errors: the minimum covariance is the best sighting's, divided by the root
-    of the number of places that agree.
+    The sightings from one place share its errors: the minimum covariance is that of the best sighting divided by the
+    root of the number of agreeing places.
     """
     places, spreads = in_map(sightings, bases)
     inside = _agreeing(places, spreads, _worth(sightings), config)
@@ -254,7 +255,7 @@ def fused(sightings: Sequence[PointSighting], bases: Bases, config: PointsConfig
 
 
 def in_map(sightings: Sequence[PointSighting], bases: Bases) -> tuple[Array, Array]:
-    """Return poses (n, 3) and covariances (n, 3, 3) of sightings, by the robot's poses."""
+    """Return poses (n, 3) and covariances (n, 3, 3) of sightings in map, from the robot's poses."""
     base = np.array([bases.get(one.stamp, one.base) for one in sightings])
     local = np.array([(*one.place[:2], one.yaw) for one in sightings])
     spreads = np.array([one.spread for one in sightings]).reshape(-1, 3, 3)
@@ -268,7 +269,7 @@ def _worth(sightings: Sequence[PointSighting]) -> NDArray[np.int64]:
 
 
 def _agreeing(places: Array, spreads: Array, worth: NDArray[np.int64], config: PointsConfig) -> NDArray[np.intp]:
-    """Return the indices of the largest group that agrees with one of its members, the latest of equal groups."""
+    """Return the indices of the largest group that agrees with one of its members; of equal groups, the latest."""
     apart = places[:, None, :2] - places[None, :, :2]
     both = spreads[:, None, :2, :2] + spreads[None, :, :2, :2]
     far = np.einsum("ijk,ijkl,ijl->ij", apart, np.linalg.inv(both), apart)
@@ -287,11 +288,11 @@ def _consensus(sightings: Sequence[PointSighting], bases: Bases, config: PointsC
 def _added(sightings: tuple[PointSighting, ...], new: PointSighting) -> tuple[PointSighting, ...]:
     """Return the sightings with the new one: the better one per place; if too many, without the second oldest."""
     for i, old in enumerate(sightings):
-        if old.worth > 1:  # from a saved map: the robot's pose is unknown
+        if old.worth > 1:  # from a saved map, with the robot's pose unknown
             continue
         moved = math.dist(old.base[:2], new.base[:2])
-        # 0.08: distance within which sightings merge, m: their errors are the same
-        # 0.08: difference in heading within which sightings merge, rad
+        # 0.08: distance within which sightings merge, m: they share their errors 0.08: difference in heading within
+        # which sightings merge, rad
         if moved < 0.08 and abs(math.remainder(old.base[2] - new.base[2], math.tau)) < 0.08:
             better = new if new.spread[0] + new.spread[4] < old.spread[0] + old.spread[4] else old
             return (*sightings[:i], better, *sightings[i + 1 :])
@@ -306,5 +307,5 @@ def _into_base(base: Pose2) -> Array:
 
 
 def nearest(trail: Sequence[tuple[int, Pose2]], place: Pose2) -> tuple[int, Pose2]:
-    """Return the instant when the robot was nearest to a place, and its pose then."""
+    """Return the instant when the robot was nearest to a place, and its pose at that instant."""
     return min(trail, key=lambda row: math.dist(row[1][:2], place[:2]))

@@ -1,4 +1,4 @@
-"""Long searches in pieces, with a budget per scan counted in work instead of time, so that runs repeat.
+"""Long searches in pieces, with a budget per scan in units of work instead of time, so that runs repeat exactly.
 
 A search is a generator that yields the cost of every piece before it executes it. The unit is one look-up in a
 likelihood grid, 2 to 3 ns; other work is converted to it.
@@ -19,19 +19,19 @@ class Work(float, Enum):
     SCAN = 9e6
     """Maximum work on searches per scan, 20 to 25 ms."""
     ELEMENT = 100.0
-    """Merging one element into a submap."""
+    """Work of merging one element into a submap."""
     DRAWN = 1000.0
-    """Drawing an element into a likelihood grid."""
+    """Work of drawing an element into a likelihood grid."""
     CELL = 0.2
-    """One cell of one level of a likelihood grid."""
+    """Work of one cell on one level of a likelihood grid."""
     EDGE = 400.0
-    """One edge of the pose graph, for bounding its drift."""
+    """Work of one edge in bounding the pose graph's drift."""
     EDGE_OPTIMISED = 4000.0
-    """One edge, for optimising the pose graph."""
+    """Work of one edge in optimising the pose graph."""
     VERIFIED = 3e6
-    """Verifying a match."""
+    """Work of verifying a match."""
     CROSSED = 2e5
-    """Comparing a keyframe with those of another submap."""
+    """Work of comparing a keyframe with those of another submap."""
 
 
 class ScanBudget:

@@ -1,7 +1,7 @@
-"""Detect that the mapped surroundings of the robot are gone: a lift has taken it to another floor, or walls moved.
+"""Detection of changed surroundings: a lift has taken the robot to another floor, or walls have moved.
 
-The latest keyframes are compared with older ones of the submap that scans are matched to, whose relative drift is
-small. Both sides look through each other's walls then, although scan after scan fits.
+The latest keyframes are compared with older ones of the submap used for matching, whose relative drift is small. After
+a change, each side looks through the other's walls, although every single scan fits the previous one.
 """
 
 from collections import deque
@@ -16,29 +16,29 @@ from monstertruck_kinematics.elementary import Array
 
 
 class ChangeDetector:
-    """Compare every new keyframe with what the map shows around it."""
+    """Compare every new keyframe with the mapped surroundings."""
 
     def __init__(self) -> None:
         self._counts: deque[Array] = deque(maxlen=STRETCH)
         self._changed = False
 
     def take(self, keyframes: KeyframeMap, local: NDArray[np.intp]) -> bool:
-        """Return whether the latest keyframe completes a stretch in which the map has changed.
+        """Return whether the latest keyframe completes a stretch over which the map has changed.
 
         Args:
             keyframes: all keyframes.
-            local: numbers of those in the submap around the latest one.
+            local: numbers of the keyframes in the submap around the latest one.
         """
         newest = len(keyframes) - 1
         older = local[local < newest - STRETCH]
         counts = finished(crossings(keyframes, np.array([newest]), older)) if len(older) else np.zeros((0, 2))
-        if not counts[:, 1].any():  # nothing of what is in view was mapped before
+        if not counts[:, 1].any():  # no part of the view was mapped before
             self._counts.clear()
         self._counts.extend(counts)
         before, self._changed = self._changed, stretch_contradicts(np.array(self._counts))
         return self._changed and not before
 
     def forget(self) -> None:
-        """Begin anew: keyframes have moved."""
+        """Restart the comparison after keyframes have moved."""
         self._counts.clear()
         self._changed = False

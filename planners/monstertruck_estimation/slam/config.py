@@ -13,7 +13,7 @@ Count = Annotated[int, Field(gt=0)]
 class MapperConfig(Schema):
     """Noise models and limits, the same for every sensor and place; every number is positive.
 
-    The defaults serve a slow truck as well as a fast robot with sparse scans; none is fitted to one log.
+    The defaults suit a slow truck as well as a fast robot with sparse scans; none is fitted to one log.
     """
 
     key_distance: Positive = 0.3
@@ -64,14 +64,13 @@ class GridConfig(Schema):
     hit: Annotated[float, Field(gt=0.5, lt=1)] = 0.7
     """Probability that the cell at the end of a beam is occupied."""
     miss: Annotated[float, Field(gt=0, lt=0.5)] = 0.4
-    """Probability that a cell a beam has passed is occupied."""
+    """Probability that a cell passed by a beam is occupied."""
     limit: Annotated[float, Field(gt=0.5, lt=1)] = 0.98
-    """Maximum certainty of a cell, so that objects that move away disappear."""
+    """Maximum certainty of a cell; it lets objects that move away disappear."""
     passed: Positive | None = None
-    """Distance freed by beams without an echo in the sensor's range (m); null to ignore such beams: a dark or a
-    polished surface returns no echo either"""
+    """Range freed by beams without an echo (m); null ignores them: dark and polished surfaces return no echo either"""
     free_footprint: bool = False
-    """The ground under the robot is free, although its sensor does not see it"""
+    """Mark the ground under the robot as free, although its sensor does not see it"""
     spacing: Positive = 0.1
     """Distance between scans integrated into the grid (m)."""
     turn: Positive = 0.1
@@ -86,11 +85,11 @@ class SlamConfig(Schema):
     """Simultaneous localisation and mapping, localisation in a saved map, or localisation by an off-board program."""
 
     mode: Literal["mapping", "localisation", "ros2"] = "mapping"
-    """`ros2`: a client localises, such as `monstertruckd ros2` with amcl or slam_toolbox; no scan is matched here"""
+    """`ros2`: a client such as `monstertruckd ros2` localises with amcl or slam_toolbox; the daemon matches no scans"""
     map: Path | None = None
     """Folder of the saved map; needed for localisation"""
     save: Path | None = None
-    """Folder for saving the map at the end and every ``save_period`` seconds; null to save nothing"""
+    """Folder for saving the map at the end and every ``save_period`` seconds; null saves nothing"""
     save_period: Positive = 60.0
     """Interval between saves of the map (s)."""
     front: Literal["planar", "kiss"] = "planar"
@@ -98,19 +97,19 @@ class SlamConfig(Schema):
     mapper: MapperConfig = MapperConfig()
     grid: GridConfig = GridConfig()
     max_tilt: Annotated[float, Field(gt=0, le=1.5)] = 0.1
-    """Maximum tilt of the scan plane (rad); scans beyond it are left out"""
+    """Maximum tilt of the scan plane (rad); scans beyond it are not used"""
     ceiling: Positive | None = None
-    """Height of the ceiling above the base (m), where there is one"""
+    """Height of the ceiling above the base (m); null without a ceiling"""
     tiles_period: Positive = 1.0
     """Time between two messages of changed tiles (s)"""
     map_period: Positive = 10.0
     """Maximum delay before a changed map is published as a whole (s)"""
     slew: tuple[Positive, Positive] = (0.3, 0.5)
-    """Maximum rate of the pose in map when it follows corrections (m/s, rad/s), so that it does not jump."""
+    """Maximum rate at which the pose in map follows corrections (m/s, rad/s); it never jumps."""
     jump: Positive = 1.0
     """Minimum size of corrections that are applied immediately (m)"""
     deviation: tuple[Positive, Positive] = (0.1, 0.05)
-    """Standard deviation of a pose that was localised off board (m, rad)"""
+    """Standard deviation of a pose localised off board (m, rad)"""
     latency: Annotated[float, Field(gt=0, le=1)] = 0.03
     """Latency of a worker step on the virtual clock (s)"""
     deadline: Annotated[float, Field(gt=0, le=60)] = 20.0

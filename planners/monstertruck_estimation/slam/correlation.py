@@ -26,19 +26,19 @@ Blocks = NDArray[np.int32]
 RESOLUTION: Final = 0.05
 """Edge of a cell, m."""
 LONGEST_ELEMENT: Final = 0.5
-"""An element is drawn to this half length at most, m."""
+"""Maximum half length of a drawn element (m)."""
 WORK: Final = 400_000
-"""Default number of evaluated blocks."""
+"""Default maximum number of evaluated blocks."""
 PIECE: Final = 2e6
-"""Look-ups of one piece of a search: 4 to 6 ms."""
+"""Number of look-ups per piece of a search: 4 to 6 ms."""
 
 
 @dataclass(frozen=True, slots=True)
 class LikelihoodGrid:
-    """Pyramid of likelihoods, 0..255, of finding a surface in a cell."""
+    """Pyramid of the likelihoods (0..255) that a cell holds a surface."""
 
     levels: Pyramid
-    """Shape (levels, rows, columns): level k is the maximum over squares of 2^k cells up and right of the cell."""
+    """Shape (levels, rows, columns): level k is the maximum over squares of 2^k cells right and up."""
     origin: tuple[float, float]
     """Corner of the cell (0, 0), m."""
 

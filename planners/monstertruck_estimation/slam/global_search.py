@@ -1,12 +1,12 @@
 """Global localisation: find the robot's place on a saved map, or that it is not on the map.
 
-A local map is built from the first scans, because one scan of a 4 m lidar looks alike in many rooms. At every keyframe
-its surroundings are matched to the whole saved map by branch and bound (Hess et al. 2016, section V), in pieces over
-the following scans; the next search begins at the latest keyframe. The result of one search is a hypothesis. It is
-accepted when three conditions hold: it fits again some distance further on, by a second search or, if no other place
-came near it, at the pose that the motion predicts; everything seen between both fits, too; and the beams since the
-first search do not contradict the saved grid. Ground that is not on the map fits nowhere, but contradicts nothing: a
-robot that has crossed it is found once it is back.
+A local map is built from the first scans, because a single scan of a 4 m lidar looks alike in many rooms. At every
+keyframe, its surroundings are matched to the whole saved map by branch and bound (Hess et al. 2016, section V), in
+pieces over the following scans; the next search begins at the latest keyframe. The result of a search is a hypothesis,
+which is accepted under three conditions. It fits again some distance further on: in a second search or, if the search
+found no similar place, at the pose predicted from motion. Everything seen between both fits matches the map, too. The
+beams since the first search do not contradict the saved grid. Unmapped ground fits nowhere but contradicts nothing, so
+a robot that has crossed it is found once it is back.
 """
 
 import math
@@ -30,25 +30,31 @@ from monstertruck_runtime.clock import SECOND
 
 LEVELS: Final = 7
 QUERY_KEYS: Final = 6
-"""Number of keyframes in the query: more would include the drift of a search without odometry."""
+"""Number of keyframes in the query: more would include the drift of a robot without odometry."""
 MIN_SEARCH_OVERLAP: Final = (0.85, 0.7)
-"""Minimum share of the query's points that fit the place found, and a unique place: in a recording from an office right
-places had 0.92 and more, wrong ones 0.84 at most; at the edge of the map unique ones of 0.7 were right."""
+"""Minimum share of the query's points that fit the place found, and a unique place.
+
+In a recording from an office, correct places had 0.92 and more, wrong ones at most 0.84; at the edge of the map, unique
+places with 0.7 were correct.
+"""
 MAX_CONTRADICTION: Final = (CONTRADICTION, 0.3)
-"""Maximum share of beams that contradict the saved grid, for the same two cases: in a recording from an office, right
-places had a median of 0.08, wrong ones 0.45; with beams of 30 m, unique right places of another had 0.27."""
+"""Maximum share of beams that contradict the saved grid, for the same two cases.
+
+In a recording from an office, correct places had a median of 0.08, wrong ones 0.45; with beams of 30 m, unique correct
+places of another recording had 0.27.
+"""
 BROKEN: Final = frozenset({MappingEvent.APART, MappingEvent.PRUNED})
-"""Events after which keyframes of the local map have moved or been renumbered: the local map is restarted."""
+"""Events after which keyframes of the local map have moved or changed number, so that the local map restarts."""
 
 
 @dataclass
 class Hypothesis:
-    """Place found by a search, with the results of later searches for it."""
+    """Place found by a search, with the results of later searches for the same place."""
 
     pose: Array
     """Pose in the saved map of the keyframe of the latest search that found the place, shape (3,)."""
     searches: list[tuple[int, bool]]
-    """Keyframe of every search that found the place, and whether it found no other place nearly as good."""
+    """Keyframe of every search that found the place, and whether the place was unique in it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +128,7 @@ class GlobalLocaliser:
     def _kept(self) -> Array | None:
         """Return the pose of the latest keyframe if a unique place still fits after the baseline.
 
-        Another place would have to fit both there and here: the search that found this one has ruled that out.
+        A rival place would have to fit both there and here; the search that found this one has ruled that out.
         """
         newest = len(self._mapper.map) - 1
         for hypothesis in self._hypotheses:
@@ -173,10 +179,10 @@ class GlobalLocaliser:
         self._hypotheses: list[Hypothesis] = []
         self._running = None
         self._due = False
-        """Whether a keyframe was added without a search for it."""
+        """Whether a keyframe was added without a search."""
 
     def _search(self) -> Pieces[SearchResult | None]:
-        """Search the whole map for the surroundings of the latest keyframe; None if they fit nowhere."""
+        """Search the whole map for the surroundings of the latest keyframe; None if they fit no place."""
         known = self._mapper.map
         newest = len(known) - 1
         numbers = self._surroundings(newest)
@@ -227,7 +233,7 @@ class GlobalLocaliser:
     def _far_enough(self, hypothesis: Hypothesis) -> tuple[int, bool] | None:
         """Return the last search far enough from the latest one for certainty; None without one.
 
-        The result is its keyframe, and whether both found the place unique.
+        The result holds its keyframe, and whether both searches found the place unique.
         """
         newest, unique = hypothesis.searches[-1]
         for key, also in reversed(hypothesis.searches):
@@ -236,14 +242,14 @@ class GlobalLocaliser:
         return None
 
     def _far_apart(self, key: int, newest: int, *, unique: bool) -> bool:
-        """Whether two fits are far enough apart to make a place certain that both, or one at most, found unique."""
+        """Whether two fits are far enough apart for certainty: both unique, or at most one of them."""
         return self._ways[newest] - self._ways[key] >= (0.8 if unique else 3.0)
 
     def _foreseen(self, hypothesis: Hypothesis, since: int, unique: bool) -> bool:
         """Whether everything seen since keyframe ``since`` fits the map, and nothing since the first search refutes it.
 
-        No single stretch may contradict the map either: the way out of a room that only looks like one of the map is
-        short.
+        No single stretch may contradict the map either: a robot may soon leave a room that only looks like a mapped
+        one.
         """
         centre, newest = hypothesis.searches[-1][0], len(self._mapper.map) - 1
         query = self._merged(np.arange(since, newest + 1), centre)

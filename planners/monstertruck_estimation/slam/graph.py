@@ -1,7 +1,8 @@
 """Pose graph in the plane: sparse Levenberg-Marquardt over relative poses, robust against false loop closures.
 
-Residual of an edge: the pose of ``target`` in the frame of ``origin`` minus its measurement. Loop edges are weighted by
-dynamic covariance scaling (Agarwal, Tipaldi, Spinello, Stachniss, Burgard 2013): switchable constraints in closed form.
+The residual of an edge is the pose of ``target`` in the frame of ``origin`` minus its measurement. Loop edges are
+weighted by dynamic covariance scaling (Agarwal, Tipaldi, Spinello, Stachniss, Burgard 2013): switchable constraints in
+closed form.
 """
 
 import math
@@ -35,25 +36,25 @@ class Edges:
     target: Index
     """Shape (n,)."""
     measured: Array
-    """Shape (n, 3): target in the frame of origin."""
+    """Measured poses of the targets in the frames of their origins, shape (n, 3)."""
     information: Array
     """Shape (n, 3, 3)."""
     loop: NDArray[np.bool_]
-    """Shape (n,): whether the edge may be wrong."""
+    """Whether each edge may be wrong, shape (n,)."""
 
     def __len__(self) -> int:
         return len(self.origin)
 
     def chosen(self, kept: NDArray[np.bool_]) -> "Edges":
-        """The marked edges."""
+        """Return the marked edges."""
         return Edges(self.origin[kept], self.target[kept], self.measured[kept], self.information[kept], self.loop[kept])
 
     def renumbered(self, number: Index) -> "Edges":
-        """The same edges with pose k renumbered to ``number[k]``."""
+        """Return the same edges with pose k renumbered to ``number[k]``."""
         return Edges(number[self.origin], number[self.target], self.measured, self.information, self.loop)
 
     def joined(self, other: "Edges") -> "Edges":
-        """The edges of both."""
+        """Return the edges of both."""
         return Edges(
             np.concatenate((self.origin, other.origin)),
             np.concatenate((self.target, other.target)),
@@ -64,31 +65,31 @@ class Edges:
 
 
 def residuals(poses: Array, edges: Edges) -> tuple[Array, Array]:
-    """Residuals, shape (n, 3), and squared Mahalanobis norms, shape (n,), of ``edges``."""
+    """Return residuals, shape (n, 3), and squared Mahalanobis norms, shape (n,), of ``edges``."""
     off = between(poses[edges.origin], poses[edges.target]) - edges.measured
     off[:, 2] = wrap(off[:, 2])
     return off, np.einsum("ni,nij,nj->n", off, edges.information, off)
 
 
 def robust_weights(squares: Array, loop: NDArray[np.bool_], switch: float = SWITCH) -> Array:
-    """Weight in (0, 1] of every edge by its squared residual; 1 for all edges but loop closures."""
+    """Return the weight in (0, 1] of every edge from its squared residual; 1 for all edges but loop closures."""
     scale = np.minimum(1.0, 2 * switch / (switch + squares))
     return np.where(loop, scale**2, 1.0)
 
 
 def parts(edges: Edges, count: int) -> Index:
-    """Number of the connected part of the graph that each of ``count`` poses belongs to, shape (count,)."""
+    """Return the connected component that each of ``count`` poses belongs to, shape (count,)."""
     graph = csr_matrix((np.ones(len(edges), np.int8), (edges.origin, edges.target)), shape=(count, count))
     _, labels = connected_components(graph, directed=False)
     return np.asarray(labels, dtype=np.int64)
 
 
 def optimise(poses: Array, edges: Edges, iterations: int = 30) -> Array:
-    """Poses, shape (n, 3), that fit the edges best, starting from ``poses``; the first of each connected part is fixed.
+    """Return the poses, shape (n, 3), that fit the edges best; the first pose of each component is fixed.
 
-    Loop edges first count in full, however large their residual, then are down-weighted step by step (graduated
-    non-convexity: Yang, Antonante, Tzoumas, Carlone 2020): a true closure of a long loop starts as far off as a
-    false one.
+    The optimisation starts from ``poses``. At first, loop edges have full weight however large their residual, and are
+    then down-weighted step by step (graduated non-convexity: Yang, Antonante, Tzoumas, Carlone 2020): a true closure of
+    a long loop starts as far off as a false one.
     """
     if not len(edges):
         return poses
@@ -114,21 +115,21 @@ def optimise(poses: Array, edges: Edges, iterations: int = 30) -> Array:
         settled = np.abs(step).max() < SETTLED or cost - cost_now < 1e-6 * cost
         if settled and switch == SWITCH:
             break
-        doubt = 4.0  # factor of its decrease from step to step
+        doubt = 4.0  # factor of the decrease per step
         switch = max(SWITCH, switch / doubt)
         cost = _cost(squares, edges.loop, switch)
     return poses
 
 
 def _cost(squares: Array, loop: NDArray[np.bool_], switch: float) -> float:
-    """Sum of the robust costs belonging to ``robust_weights``."""
+    """Return the sum of the robust costs that belong to ``robust_weights``."""
     scale = np.minimum(1.0, 2 * switch / (switch + squares))
     robust = scale**2 * squares + switch * (1 - scale) ** 2
     return float(np.where(loop, robust, squares).sum())
 
 
 class _Pattern:
-    """The sparse normal equations of one set of edges: ordered once for little fill, assembled again for every step."""
+    """Sparse normal equations of one set of edges: ordered once for low fill-in, assembled again in every step."""
 
     def __init__(self, edges: Edges, count: int, fixed: Index) -> None:
         self._count = count
@@ -147,7 +148,7 @@ class _Pattern:
         self._a, self._b = a, b
 
     def solve(self, poses: Array, edges: Edges, off: Array, weights: Array, damping: float) -> Array:
-        """One damped Gauss-Newton step, shape (n, 3)."""
+        """Return one damped Gauss-Newton step, shape (n, 3)."""
         ground = damping * np.eye(3)
         data = np.zeros((len(self._columns), 3, 3))
         data[self._diagonal] = ground
@@ -156,14 +157,14 @@ class _Pattern:
         ends = poses[edges.origin], poses[edges.target]
         _assemble(*ends, off, edges.information, weights, self._a, self._b, self._slots, data, gradient)
         rows = bsr_matrix((data, self._columns, self._offsets)).tocsr()
-        # Symmetric: the rows are the columns.
+        # Symmetric: rows equal columns.
         matrix = csc_matrix((rows.data, rows.indices, rows.indptr), shape=rows.shape)
         factors = splu(matrix, permc_spec="NATURAL", options={"SymmetricMode": True, "DiagPivotThresh": 0.0})
         return -np.asarray(factors.solve(gradient.ravel())).reshape(-1, 3)[self._place]
 
 
 def _ordering(edges: Edges, count: int) -> Index:
-    """Place of every pose among the unknowns, shape (count,), by minimum degree on the graph of the poses."""
+    """Return the position of every pose among the unknowns, shape (count,), by minimum degree on the graph."""
     own = np.arange(count)
     rows = np.concatenate((edges.origin, edges.target, own))
     columns = np.concatenate((edges.target, edges.origin, own))
@@ -178,7 +179,7 @@ def _assemble(
     origins: Array, targets: Array, off: Array, information: Array, weights: Array, first: Index, second: Index,
     slots: Index, data: Array, gradient: Array,
 ) -> None:  # fmt: skip
-    """Add every edge's blocks to ``data`` at its four ``slots``, and its pull to ``gradient``."""
+    """Add every edge's blocks to ``data`` at its four ``slots``, and its gradient to ``gradient``."""
     by_origin, by_target = np.zeros((3, 3)), np.zeros((3, 3))
     by_origin[2, 2], by_target[2, 2] = -1.0, 1.0
     for e in range(first.size):
@@ -205,21 +206,21 @@ def _assemble(
 
 
 def drift(poses: Array, edges: Edges, spread: Array, source: int) -> tuple[Array, Array]:
-    """Covariance of every pose in the frame of ``source``, along the path of least variance through the graph.
+    """Return the covariance of every pose in the frame of ``source``, along the path of least variance in the graph.
 
-    An upper bound: other paths are ignored.
+    The result is an upper bound, since other paths are ignored.
 
     Args:
-        poses: shape (n, 3).
+        poses: poses of the graph, shape (n, 3).
         edges: m edges of the graph.
-        spread: shape (m, 2): variance of each edge's translation (each axis, m^2) and of its yaw (rad^2).
-        source: number of the pose that is the frame.
+        spread: variances of each edge's translation (per axis, m^2) and yaw (rad^2), shape (m, 2).
+        source: number of the reference pose.
 
     Returns:
-        Covariances, shape (n, 3, 3), infinite where no path leads; and the paths' summed variance, m^2, shape (n,).
+        Covariances, shape (n, 3, 3), infinite for unconnected poses; and the paths' summed variance (m^2), shape (n,).
     """
     count = len(poses)
-    lever = 4.0  # lever that converts an error of the yaw into an error of the translation, m
+    lever = 4.0  # lever arm that converts an error of the yaw into an error of the translation, m
     variance = spread[:, 0] + spread[:, 1] * lever**2
     low, high = np.minimum(edges.origin, edges.target), np.maximum(edges.origin, edges.target)
     order = np.lexsort((variance, high, low))
@@ -246,7 +247,7 @@ def drift(poses: Array, edges: Edges, spread: Array, source: int) -> tuple[Array
 
 @njit(cache=True)
 def _carry(local: Array, order: Index, parents: Index, steps: Array, source: int) -> Array:
-    """Covariances compounded from parent to child; ``local`` are the poses in the frame of the source."""
+    """Compound covariances from parent to child; ``local`` are the poses in the frame of the source."""
     result = np.full((local.shape[0], 3, 3), np.inf)
     result[source] = 0.0
     for node in order:

@@ -1,8 +1,8 @@
-"""Occupancy grid by the beam model: log odds of every cell, growing, its changes published as tiles.
+"""Occupancy grid by the beam model: log odds of every cell in a growing area, with changes published as tiles.
 
 Inverse sensor model with constant log odds for the end of a beam and for the passed cells (Thrun, Burgard, Fox:
-Probabilistic Robotics, table 9.2). A scan counts once per cell, and an end outweighs passes: otherwise walls seen at a
-grazing angle, and everything near the sensor, would be counted by the dozen.
+Probabilistic Robotics, table 9.2). A scan changes each cell once, and an end outweighs passes: otherwise walls at a
+grazing angle, and everything near the sensor, would be counted dozens of times.
 """
 
 import itertools
@@ -25,11 +25,11 @@ from monstertruck_runtime.clock import SECOND
 Cells = NDArray[np.int8]
 
 TILE: Final = 64
-"""Cells of a tile's edge; the grid's bounds are whole tiles."""
+"""Cells per edge of a tile; the grid's bounds are whole tiles."""
 SCALE: Final = 256.0
 """Steps of the stored log odds per unit."""
 NONE: Final = np.empty((0, 2))
-"""No points."""
+"""Empty array of points."""
 
 
 class OccupancyGrid:
@@ -49,7 +49,7 @@ class OccupancyGrid:
         self.clear()
 
     def clear(self) -> None:
-        """Empty the grid; ``changes`` still compares with the published grid."""
+        """Clear the grid; ``changes`` still compares with the published one."""
         self._corner = np.zeros(2, np.int64)
         self._odds = np.zeros((0, 0), np.int16)
         self._marks = np.zeros((0, 0), np.uint16)
@@ -61,9 +61,9 @@ class OccupancyGrid:
         """Integrate one scan.
 
         Args:
-            sensor: shape (2,), where the beams began, in map, m.
-            points: shape (n, 2), where they ended, in map, m; all finite.
-            passed: shape (k, 2), up to where other beams met nothing, in map, m; all finite.
+            sensor: start of the beams in map, shape (2,) (m).
+            points: ends of the beams in map, shape (n, 2) (m); all finite.
+            passed: free ends of beams without an echo in map, shape (k, 2) (m); all finite.
         """
         if not len(points) and not len(passed):
             return
@@ -87,7 +87,7 @@ class OccupancyGrid:
         )
 
     def patch(self) -> GridPatch:
-        """The whole grid, without unknown margins; without cells before the first scan."""
+        """Return the whole grid without unknown margins; it has no cells before the first scan."""
         cells = self._percent[self._odds + self._limit]
         rows, columns = np.flatnonzero((cells != UNKNOWN).any(axis=1)), np.flatnonzero((cells != UNKNOWN).any(axis=0))
         if not len(rows):
@@ -134,7 +134,7 @@ class OccupancyGrid:
         self._touched = low, high
 
     def _cover(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> None:
-        """Grow by whole tiles until the cells ``low`` and ``high`` are inside."""
+        """Grow by whole tiles to include the cells ``low`` and ``high``."""
         size = np.array(self._odds.shape[::-1])
         end = self._corner + size
         if size.all():
@@ -156,7 +156,7 @@ def _steps(probability: float) -> int:
 
 
 def _percentages(limit: int) -> Cells:
-    """Occupancy in percent by log odds + ``limit``; exactly zero log odds are unknown."""
+    """Return a table of occupancy (%) by log odds + ``limit``; log odds of exactly zero are unknown."""
     odds = np.arange(-limit, limit + 1) / SCALE
     percent = np.round(100.0 / (1.0 + np.exp(-odds))).astype(np.int8)
     percent[limit] = UNKNOWN
@@ -165,7 +165,7 @@ def _percentages(limit: int) -> Cells:
 
 @njit(cache=True)
 def _cells(points, sensor, scale):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
-    """Cells of the sensor (row 0) and of the ends, with their bounds; (column, row) each."""
+    """Return the cells of the sensor (row 0) and of the ends as (column, row), and their bounds."""
     n = points.shape[0]
     ends = np.empty((n + 1, 2), np.int32)
     low, high = np.empty(2, np.int64), np.empty(2, np.int64)
@@ -183,17 +183,17 @@ def _cells(points, sensor, scale):  # type: ignore[no-untyped-def] # noqa: ANN00
 
 @njit(cache=True)
 def trace(odds, marks, stride, ends, corner, mark, model, hits):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN201
-    """Add one scan to a grid: first the ends of the beams, then the passed cells, every cell once.
+    """Add one scan to a grid: first the ends of the beams, then the passed cells, each cell once.
 
     Args:
-        odds: int16, flat; log odds of the cells.
-        marks: uint16, flat; number of the last scan that changed each cell.
-        stride: cells of a row.
-        ends: int32, shape (n + 1, 2), (column, row) of the sensor and of every beam's end; all inside the grid.
+        odds: log odds of the cells, int16, flat.
+        marks: number of the last scan that changed each cell, uint16, flat.
+        stride: number of cells per row.
+        ends: cells (column, row) of the sensor and of every beam's end, int32, shape (n + 1, 2); all inside the grid.
         corner: (column, row) of the first cell.
         mark: number of this scan.
-        model: log odds added by an end, by a pass (negative), and their limit.
-        hits: the first so many beams ended at something; the others only pass.
+        model: log odds added by an end and by a pass (negative), and their limit.
+        hits: number of leading beams with an echo; the others only pass.
     """
     hit, miss, limit = model
     x0, y0 = ends[0, 0] - corner[0], ends[0, 1] - corner[1]
@@ -203,7 +203,7 @@ def trace(odds, marks, stride, ends, corner, mark, model, hits):  # type: ignore
         if marks[at] != mark:
             marks[at] = mark
             odds[at] = min(odds[at] + hit, limit)
-    fraction_bits = 16  # bits behind the point while a beam is followed
+    fraction_bits = 16  # number of fractional bits along a beam
     half = 1 << (fraction_bits - 1)
     for i in range(1, n):
         if i > 1 and ends[i, 0] == ends[i - 1, 0] and ends[i, 1] == ends[i - 1, 1]:
@@ -212,7 +212,7 @@ def trace(odds, marks, stride, ends, corner, mark, model, hits):  # type: ignore
         across, along = abs(dx) >= abs(dy), max(abs(dx), abs(dy))
         if along == 0:
             continue
-        # One cell of the longer axis a step, the shorter one in fixed point: no branch except for the mark.
+        # One cell of the longer axis per step, the shorter one in fixed point: no branch except for the mark.
         if across:
             step, side, slope = (1 if dx > 0 else -1), stride, (dy << fraction_bits) // along
         else:
@@ -228,7 +228,7 @@ def trace(odds, marks, stride, ends, corner, mark, model, hits):  # type: ignore
 
 
 def outline(length: float, width: float, step: float) -> Array:
-    """Points of a rectangle round the origin, shape (n, 2), at most ``step`` apart, m."""
+    """Return points of a rectangle around the origin, shape (n, 2), at most ``step`` apart (m)."""
     x, y = length / 2, width / 2
     corners = np.array([(x, y), (-x, y), (-x, -y), (x, -y), (x, y)])
     sides = [
@@ -239,11 +239,11 @@ def outline(length: float, width: float, step: float) -> Array:
 
 
 def passed_ends(inputs: ScanInput, reach: float) -> Array:
-    """Ends, shape (k, 2), in base, m, of the beams that met nothing, at ``reach`` m or the sensor's own if it is less.
+    """Return the ends in base, shape (k, 2) (m), of beams without an echo, at ``reach`` or the sensor's maximum range.
 
-    Of a level scan only: what a tilted beam passes is not at the height of the others.
+    Only a level scan has any: a tilted beam passes at another height than the other scans.
     """
-    level = 0.02  # maximum slope of the scanning plane for beams without a return: 0.1 m over 5 m
+    level = 0.02  # maximum slope of the scan plane for beams without an echo: 0.1 m over 5 m
     if inputs.slopes is not None and max(map(abs, inputs.slopes)) > level:
         return NONE
     beams = np.flatnonzero(np.isposinf(inputs.ranges))
@@ -254,11 +254,11 @@ def passed_ends(inputs: ScanInput, reach: float) -> Array:
 
 MILLIMETRES: Final = 1000.0
 PAGE_POINTS: Final = 1 << 16
-"""Points of a page, 256 kB."""
+"""Number of points per page, 256 kB."""
 
 
 class PointPages:
-    """Points of many scans in pages that are never freed, so that the heap does not fragment."""
+    """Points of many scans in pages that are never freed, which prevents fragmentation of the heap."""
 
     def __init__(self) -> None:
         self._pages: list[NDArray[np.int16]] = []
@@ -280,7 +280,7 @@ class PointPages:
         """Drop all but the ``chosen`` scans (rising numbers) and compact the pages."""
         kept = [self._places[index] for index in chosen]
         self._page, self._row, self._places = 0, 0, []
-        for page, first, count in kept:  # never behind its own place, so nothing is overwritten before it has moved
+        for page, first, count in kept:  # never behind its source, so no row is overwritten before it has moved
             self.append(self._pages[page][first : first + count])
 
     def __len__(self) -> int:
@@ -294,11 +294,11 @@ class PointPages:
 class GridBuilder:
     """Occupancy grid of stored scans, rebuilt when optimisation moves their poses.
 
-    The place where the robot stands is free: its outline counts as ends of beams that met nothing.
+    The ground under the robot is free: its outline is stored as ends of beams without an echo.
 
     Args:
-        config: the grid, and which scans are integrated.
-        body: length and width of the robot, m; None if unknown.
+        config: settings of the grid and of the scans to integrate.
+        body: length and width of the robot (m); None if unknown.
     """
 
     def __init__(self, config: GridConfig, body: tuple[float, float] | None = None) -> None:
@@ -309,25 +309,25 @@ class GridBuilder:
         self._poses: list[Array] = []
         self._points = PointPages()
         self._returns: list[int] = []
-        """How many of each scan's points are returns; the others end beams that met nothing."""
+        """Number of each scan's points that are echoes; the others end beams without an echo."""
         self._mounts: list[Pose2] = []
 
     def __len__(self) -> int:
         return len(self._stamps)
 
     def add(self, scan: Scan, stamp: int, pose: Array, mount: Pose2, passed: Array = NONE) -> bool:
-        """Integrate a scan if the robot moved far enough since the last one of its lidar; returns whether it did.
+        """Integrate a scan if the robot has moved far enough since the last one of its lidar; return whether it did so.
 
         Args:
             scan: points in base.
-            stamp: ns, later than those of the same lidar before.
-            pose: shape (3,), base in map.
+            stamp: stamp (ns), later than earlier ones of the same lidar.
+            pose: base in map, shape (3,).
             mount: planar pose of the sensor in base.
-            passed: shape (k, 2), ends in base of beams that met nothing, see ``passed_ends``.
+            passed: ends in base of beams without an echo, shape (k, 2), see ``passed_ends``.
         """
         if not len(scan) or not self._due(stamp, pose, mount):
             return False
-        longest_point = 32.7  # points are kept as 16-bit millimetres, m
+        longest_point = 32.7  # limit of points stored as 16-bit millimetres, m
         near, far = (ends[np.abs(ends).max(axis=1) < longest_point] for ends in (scan.points, passed))
         self._stamps.append(stamp)
         self._poses.append(np.array(pose))
@@ -340,17 +340,17 @@ class GridBuilder:
         return True
 
     def update_poses(self, stamps: NDArray[np.int64], poses: Array) -> bool:
-        """Rebuild the grid if the trajectory moved the stored scans; returns whether it did.
+        """Rebuild the grid if the trajectory has moved the stored scans; return whether it did so.
 
         Args:
-            stamps: shape (n,), ns, rising; poses between them are interpolated.
-            poses: shape (n, 3), base in map.
+            stamps: rising stamps (ns), shape (n,); poses between them are interpolated.
+            poses: base in map, shape (n, 3).
         """
         if not self._stamps or not len(stamps):
             return False
         now = interpolate(stamps.astype(np.float64), poses, np.array(self._stamps, np.float64))
         off = between(np.array(self._poses), now)
-        redraw_motion = (0.5, 0.01)  # the grid is rebuilt when a pose moved by more than this (cells, rad)
+        redraw_motion = (0.5, 0.01)  # minimum move of a pose (cells, rad) that rebuilds the grid
         if (np.hypot(off[:, 0], off[:, 1]) < redraw_motion[0] * self._config.resolution).all() and (
             np.abs(off[:, 2]) < redraw_motion[1]
         ).all():
@@ -363,8 +363,8 @@ class GridBuilder:
         """Rebuild the grid from the scans that the trajectory marks.
 
         Args:
-            stamps: shape (n,), ns, rising.
-            kept: shape (n,), the marks.
+            stamps: rising stamps (ns), shape (n,).
+            kept: marks, shape (n,).
         """
         at = np.minimum(np.searchsorted(stamps, self._stamps), len(stamps) - 1)
         self._keep(np.flatnonzero(kept[at]).tolist())
@@ -395,7 +395,7 @@ class GridBuilder:
         self.grid.add(transform(pose, np.array([mount[:2]]))[0], points[:returns], passed)
 
     def _prune(self) -> None:
-        """Drop every other scan of each lidar except in the latest quarter."""
+        """Drop every second scan of each lidar, except in the latest quarter."""
         recent, counts = 3 * len(self) // 4, Counter[Pose2]()
         kept = []
         for i, mount in enumerate(self._mounts):

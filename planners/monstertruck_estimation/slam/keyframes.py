@@ -1,4 +1,4 @@
-"""The keyframe map: keyframes with their pose graph, the trajectory, pruning, and joint registration at the end."""
+"""Keyframe map: keyframes with their pose graph, the trajectory, pruning, and joint registration at the end."""
 
 import itertools
 import math
@@ -20,7 +20,7 @@ from monstertruck_runtime.clock import SECOND
 
 
 class GrowingArray:
-    """Rows of one shape, appended in amortised constant time."""
+    """Array that grows by rows in amortised constant time."""
 
     def __init__(self, *shape: int, dtype: type = float) -> None:
         self._data: NDArray[Any] = np.zeros((64, *shape), dtype)
@@ -41,7 +41,7 @@ class GrowingArray:
 
     @property
     def view(self) -> NDArray[Any]:
-        """The rows, without a copy."""
+        """Return the rows without a copy."""
         return self._data[: self._count]
 
     def __len__(self) -> int:
@@ -57,7 +57,7 @@ class Keyframe:
     scan: Scan
     """Downsampled points in base."""
     cloud: Cloud
-    """The same with a hash for neighbour search."""
+    """The same points with a hash for neighbour search."""
 
 
 class EdgeList:
@@ -135,11 +135,11 @@ class EdgeList:
 
 
 class Trajectory:
-    """Every scan's pose relative to a keyframe, so that the whole trajectory moves with the graph.
+    """Poses of all scans relative to keyframes, so that the whole trajectory moves with the graph.
 
-    A scan that becomes a keyframe is stored twice: relative to the previous keyframe, and as itself. Optimisation may
-    move one against the other; this offset is distributed over the scans between, or the trajectory would jump at
-    keyframes.
+    A scan that becomes a keyframe is stored twice: relative to the previous keyframe, and relative to itself.
+    Optimisation may move one against the other. Their offset is distributed over the scans between them, so that the
+    trajectory has no jumps at keyframes.
 
     Args:
         most: maximum number of scans stored; beyond it, every second one is dropped.
@@ -187,7 +187,7 @@ class Trajectory:
         return np.delete(stamps, joints), np.delete(poses, joints, axis=0)
 
     def at(self, stamps: NDArray[np.int64], keys: Array, joined: NDArray[np.bool_]) -> Array:
-        """Return poses (n, 3) at any instants, linear between scans; NaN outside, and off the map.
+        """Return poses (n, 3) at any instants, interpolated between scans; NaN outside, and for submaps off the map.
 
         Args:
             stamps: (n,), ns.
@@ -227,7 +227,7 @@ TURN_LEVER: Final = 0.7
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Join:
-    """Join of two submaps, possibly wrong."""
+    """Join of two submaps that may be wrong."""
 
     own: int
     """Number of the robot's submap, to which later keyframes belong."""
@@ -240,10 +240,10 @@ class Join:
 
 
 class _Drift(NamedTuple):
-    """Drift against one keyframe, and what it was computed from."""
+    """Drift bound against one keyframe, and its inputs."""
 
     poses: Array
-    """Poses, replaced as a whole by every change."""
+    """Poses of the keyframes; every change replaces the array."""
     revision: int
     """Revision of the edges."""
     source: int
@@ -265,7 +265,7 @@ class KeyframeMap:
         self.part: NDArray[np.int64] = np.zeros(0, np.int64)
         """Submap of every keyframe, by the number of its first keyframe, shape (n,); 0 is the map."""
         self.doubtful: list[Join] = []
-        """Joins, in their order, that later observations have not confirmed yet."""
+        """Joins, in their order, not yet confirmed by later observations."""
         self._drift: _Drift | None = None
 
     def __len__(self) -> int:
@@ -281,7 +281,7 @@ class KeyframeMap:
     def place(self, at: int, pose: Array, part: int) -> None:
         """Align the submap of keyframe ``at`` with submap ``part``, in whose frame ``at`` is at ``pose``, shape (3,).
 
-        The map itself stays where it is.
+        The map itself never moves.
         """
         own = int(self.part[at])
         origin, target = (self.poses[at], pose) if own else (pose, self.poses[at])
@@ -290,22 +290,22 @@ class KeyframeMap:
         self.poses[moved] = compose(target, between(origin, self.poses[moved]))
 
     def join(self, one: int, other: int) -> None:
-        """Merge submaps ``one`` and ``other``, now related by edges; the join is yet to be confirmed."""
+        """Merge submaps ``one`` and ``other``, now related by edges; the join awaits confirmation."""
         own, other = (one, other) if one == self.part[-1] else (other, one)
         self.doubtful.append(Join(own, other, np.flatnonzero(self.part == other), len(self)))
         self.part[self.part == max(own, other)] = min(own, other)
 
     def sides(self, join: Join) -> tuple[Numbers, Numbers]:
-        """Return the keyframes, rising, of the robot's side of a join in doubt, including later ones, and of the other.
+        """Return the keyframes, rising, of both sides of a join in doubt: the robot's with later ones, and the other's.
 
-        Keyframes from later joins belong to neither.
+        Keyframes of later joins belong to neither side.
         """
         later = self.doubtful[self.doubtful.index(join) :]
         apart = np.concatenate([each.others for each in later])
         return np.setdiff1d(np.flatnonzero(self.part == self.part[join.others[0]]), apart), join.others
 
     def separate(self, join: Join) -> None:
-        """Undo a ``join`` in doubt, and later ones: no edge relates the submaps they joined."""
+        """Undo a ``join`` in doubt, and later ones: no edge then relates the submaps they joined."""
         while join in self.doubtful:
             own, others = self.sides(self.doubtful[-1])
             last = self.doubtful.pop()
@@ -319,7 +319,7 @@ class KeyframeMap:
         return np.asarray(self.part == 0)
 
     def add_odometry_edge(self, delta: Array, covariance: Array) -> None:
-        """Add the edge from the last keyframe but one to the last."""
+        """Add the edge between the last two keyframes."""
         new = len(self) - 1
         place, turn = deviations(covariance)
         information: Array = np.asarray(np.linalg.inv(covariance + 1e-6 * np.eye(3)), dtype=np.float64)
@@ -367,7 +367,7 @@ class KeyframeMap:
     def drift(self, source: int) -> tuple[Array, Array]:
         """Return the bound of the drift against ``source``: covariances in its frame, and summed variances.
 
-        The latest result is kept, because several parts of a step ask for it.
+        The latest result is kept, because a step needs it several times.
         """
         known, revision = self._drift, self.edges.revision
         if known is None or known.poses is not self.poses or known[1:3] != (revision, source):
@@ -403,10 +403,10 @@ class KeyframeMap:
         self.poses = optimise(self.poses, self.edges.edges())
 
     def refine(self) -> bool:
-        """Register all keyframes jointly (seconds of work), if those far apart in time agree better then.
+        """Register all keyframes jointly (seconds of work), if those far apart in time agree better afterwards.
 
         Returns:
-            Whether the poses are those of the joint registration; else they are the graph's.
+            Whether the poses come from the joint registration; otherwise they come from the graph.
         """
         if len(self) < 2:
             return False
@@ -419,11 +419,11 @@ class KeyframeMap:
         return True
 
     def prune(self) -> tuple[NDArray[np.bool_], NDArray[np.int64], Array]:
-        """Remove the keyframes that others make redundant.
+        """Remove redundant keyframes.
 
         Returns:
-            For every former keyframe whether it is kept, (n,), the number of the keyframe that represents it, (n,), and
-            its pose in that keyframe's frame, (n, 3).
+            Three arrays by former keyframe: whether it is kept (n,), the number of the keyframe that represents it
+            (n,), and its pose in that keyframe's frame (n, 3).
         """
         gone, stand_in, edges, spread, odometry = pruned(
             self.poses, self.part, self.edges.edges(), self.edges.spread, self.edges.odometry, self.config.pruning
@@ -462,10 +462,10 @@ def pruned(
     odometry: NDArray[np.bool_],
     share: float,
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64], Edges, Array, NDArray[np.bool_]]:
-    """Prune: remove the most redundant ``share`` of the poses, no two of them neighbours in the graph, never the first.
+    """Select the most redundant ``share`` of the poses for removal: no two neighbours in the graph, never the first.
 
-    Every edge of a removed pose is composed with its most certain edge, so that it holds for the neighbour at the other
-    end of that: marginalisation along one edge.
+    Every edge of a removed pose is composed with that pose's most certain edge, and then attached to the neighbour at
+    its other end: marginalisation along one edge.
 
     Returns:
         Marks of the removed poses (n,), the neighbour that represents each (itself if it stays) (n,), and the edges of
@@ -528,10 +528,10 @@ def _handed_over(
 def _surest(
     origin: NDArray[np.int64], target: NDArray[np.int64], odometry: NDArray[np.bool_], sureness: Array
 ) -> NDArray[np.bool_]:
-    """Marks of the most certain edge of each kind between two keyframes.
+    """Mark the most certain edge of each kind between two keyframes.
 
-    Composed edges share an edge and so are correlated: together they would be overconfident, and their number would
-    grow with the length of the run.
+    Composed edges share an edge and are therefore correlated: together they would be overconfident, and their number
+    would grow with the length of the run.
     """
     low, high = np.minimum(origin, target), np.maximum(origin, target)
     order = np.lexsort((-sureness, odometry, high, low))
@@ -559,15 +559,15 @@ REFINE_NEIGHBOURS: Final = 2
 REFINE_PARTNERS: Final = 12
 """Maximum number of earlier keyframes that each is paired with."""
 REFINE_REACH: Final = 4.5
-"""Maximum distance of a partner (m); an angle of view counts a metre per radian."""
+"""Maximum distance of a partner (m); one radian between the views adds one metre."""
 REFINE_OVERLAP: Final = 0.4
 
 
 def partners(poses: Array) -> NDArray[np.int64]:
-    """Pairs (earlier, later), shape (n, 2): the two preceding, and the nearest of every stretch of the trajectory."""
+    """Return pairs (earlier, later), shape (n, 2): the two preceding keyframes, and the nearest of every stretch."""
     result: list[tuple[int, int]] = []
     steps = np.hypot(*np.diff(poses[:, :2], axis=0, prepend=poses[:1, :2]).T)
-    # Minimum length of trajectory per partner keyframe, besides the neighbours in time, m.
+    # Minimum length of trajectory per partner keyframe, apart from the neighbours in time, m.
     refine_spacing = 1.0
     stretch = np.floor(np.cumsum(steps) / refine_spacing).astype(np.int64)
     for k in range(1, len(poses)):
@@ -584,7 +584,7 @@ def partners(poses: Array) -> NDArray[np.int64]:
 def witnesses(keys: list[Keyframe], poses: Array, part: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return pairs (earlier, later), shape (n, 2), of one place at times far apart that are not ``partners``.
 
-    The joint registration has no term for them, so that they can check it.
+    The joint registration has no term for these pairs, so they can check it.
     """
     stamps = np.array([key.stamp for key in keys])
     witness_pause = 60.0  # seconds between two views of a place that are used to check the joint registration
@@ -619,11 +619,11 @@ def refine(keys: list[Keyframe], poses: Array, steady: Edges, loops: Edges, roun
     """Return the poses, shape (n, 3), at which all scans fit each other best.
 
     Args:
-        keys: the keyframes.
+        keys: keyframes.
         poses: current poses, shape (n, 3).
         steady: edges that are always used (odometry).
-        loops: edges of loop closures, used where no registered pair replaces them: two views of one place from opposite
-            sides overlap too little to be a pair.
+        loops: edges of loop closures, used unless a registered pair replaces them: two views of one place from opposite
+            sides overlap too little for a pair.
         rounds: maximum number of rounds.
     """
     pairs = partners(poses)
@@ -657,7 +657,7 @@ def _stretches(origin: NDArray[np.int64], target: NDArray[np.int64], i: int, j: 
 
 
 def _linearised(keys: list[Keyframe], poses: Array, pairs: NDArray[np.int64], reach: float) -> Edges:
-    """Return one edge per overlapping pair: its pose after a Gauss-Newton step, and the information."""
+    """Return one edge per overlapping pair: pose after a Gauss-Newton step, and information."""
     places = between(poses[pairs[:, 0]], poses[pairs[:, 1]])
     measured, information, kept = np.zeros((len(pairs), 3)), np.zeros((len(pairs), 3, 3)), np.zeros(len(pairs), bool)
     for k, (i, j) in enumerate(pairs.tolist()):

@@ -1,7 +1,8 @@
 """kiss-icp (Vizzo et al. 2023) for planar scans: its map and registration as a scan matcher.
 
-All points are kept: the package's own second downsampling leaves too few of a planar scan. The matcher returns neither
-a score nor a failure, so every result is measured like ours (overlap, residual, information) and passes the same gate.
+All points are kept, because the package's own second downsampling leaves too few of a planar scan. The matcher returns
+neither a score nor a failure, so every result is measured like our own (overlap, residual, information) and passes the
+same gate.
 """
 
 import math
@@ -19,7 +20,7 @@ from monstertruck_kinematics.elementary import Array
 
 
 class KissMap:
-    """Points in one frame, to which scans are registered."""
+    """Points in one frame, for the registration of scans."""
 
     def __init__(self) -> None:
         config = KISSConfig()
@@ -35,15 +36,15 @@ class KissMap:
         self._map.clear()
 
     def add(self, points: Array) -> None:
-        """Take points, (n, 2) (m)."""
+        """Add points, (n, 2) (m)."""
         self._map.add_points(_spatial(points))
 
     def update(self, points: Array, pose: Array) -> None:
-        """Take the points, (n, 2), of a scan at ``pose``, (3,), and forget those far from it."""
+        """Add the points, (n, 2), of a scan at ``pose``, (3,), and forget distant points."""
         self._map.update(_spatial(points), _matrix(pose))
 
     def align(self, points: Array, guess: Array) -> Array:
-        """Return a scan's pose, (3,): the guess if the map is empty, not finite if the registration failed."""
+        """Return a scan's pose, (3,): the guess for an empty map, not finite if the registration failed."""
         if self._map.empty():
             return guess
         reach = 0.5  # maximum distance of a pair, m
@@ -72,7 +73,7 @@ def _matrix(pose: Array) -> Array:
 
 
 class KissMatcher:
-    """``ScanMatcher`` that registers to the mapper's submap, so that loop closures move its map, too."""
+    """``ScanMatcher`` that registers to the mapper's submap, so that loop closures move its map along."""
 
     def __init__(self) -> None:
         self._map = KissMap()

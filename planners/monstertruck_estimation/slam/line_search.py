@@ -1,7 +1,7 @@
-"""Search along the direction that a match constrains least: is its place the only one that the prediction allows?
+"""Search for similar places along the direction that a match constrains least, within the prediction's covariance.
 
-A pillar of a corridor fits at the next one, and a wall ahead at every recess. The information of a match does not say
-so, because it takes the pairs of points as they are.
+A pillar in a corridor also fits the next pillar, and a wall ahead also fits every recess. The information matrix of a
+match does not show this ambiguity, because it is based on the current pairs of points.
 """
 
 import math
@@ -19,7 +19,7 @@ class LinePeak(NamedTuple):
     """Best pose on the line."""
 
     pose: Array
-    """Base in map, shape (3,)."""
+    """Pose of base in map, shape (3,)."""
     apart: bool
     """Whether it is not the match's place."""
     only: bool
@@ -36,14 +36,14 @@ def best_along(
         points: ends of beams in base, shape (n, 2) (m).
         match: an accepted match.
         guess: predicted pose, shape (3,).
-        covariance: its covariance, shape (3, 3); it limits the search to three standard deviations.
+        covariance: covariance of ``guess``, shape (3, 3); it limits the search to three standard deviations.
 
     Returns:
         None if the prediction allows no other place.
     """
     direction = np.array((math.cos(match.direction), math.sin(match.direction)))
     half = 3.0 * math.sqrt(float(direction @ covariance[:2, :2] @ direction))
-    same_place = 0.25  # three standard deviations of the likelihood round a surface, m
+    same_place = 0.25  # three standard deviations of the likelihood around a surface, m
     if half <= same_place:
         return None
     middle = float(direction @ (guess - match.pose)[:2])
@@ -62,7 +62,7 @@ def best_along(
 
 
 def _likelihoods(grid: LikelihoodGrid, ends: Array, shifts: Array) -> Array:
-    """Likelihoods 0..1, shape (m, n), of points ``ends``, (n, 2) (m), that are moved by each of ``shifts``, (m, 2)."""
+    """Return the likelihoods, 0..1, shape (m, n), of ``ends``, (n, 2) (m), moved by each of ``shifts``, (m, 2)."""
     level = grid.levels[0]
     cells = np.floor((ends[None] + shifts[:, None] - grid.origin) / RESOLUTION).astype(np.int64)
     columns, rows = cells[..., 0], cells[..., 1]

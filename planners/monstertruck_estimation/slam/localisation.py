@@ -1,8 +1,8 @@
-"""Localisation in a saved map: tracking by scan matching, and a search of the whole map if the place is unknown.
+"""Localisation in a saved map: tracking by scan matching, and a search of the whole map for an unknown place.
 
-The estimator checks the result of a search against the whole map over the next metres, and every match against the
-saved grid: it rejects a match that fits walls while its beams cross others. Beams that end in unknown cells are not
-matched: at the edge of the map they are no evidence for or against a pose.
+Over the metres after a search of the whole map, the estimator verifies its result. It also checks every match against
+the saved grid, and rejects a match that fits walls while its beams cross others. Beams that end in unknown cells are
+not matched: at the edge of the map they are no evidence for or against a pose.
 """
 
 import math
@@ -44,14 +44,14 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.health import LocalisationStatus, OdometryUse
 
 FOUND_COVARIANCE: Final = np.diag(np.square((0.05, 0.05, 0.02)))
-"""Covariance of a pose found by global localisation (m^2, rad^2)."""
+"""Covariance of a pose from global localisation (m^2, rad^2)."""
 MATCH_COVARIANCE: Final = np.diag(np.square((0.02, 0.02, 0.01)))
-"""Covariance of a match itself (m^2, rad^2)."""
+"""Covariance of a single match (m^2, rad^2)."""
 MAX_CONTRADICTION: Final = 0.3
-"""Maximum share of a valid match's beams that contradict the saved grid, as people and new furniture do, too."""
+"""Maximum share of a valid match's beams that contradict the saved grid, e.g. because of people or new furniture."""
 
 Predicted = tuple[Array, Array, Array]
-"""Pose predicted from motion, shape (3,), and its covariances, (3, 3): for the match window, and as published."""
+"""Pose predicted from motion, shape (3,), with its covariances for the match window and for publishing, (3, 3)."""
 
 
 def submap_of(saved: SavedMap) -> Submap:
@@ -74,7 +74,7 @@ class LocalisationEstimator:
     Args:
         saved: the map.
         config: noise models.
-        start: approximate pose of base in map; None if unknown.
+        start: approximate initial pose of base in map; None if unknown.
     """
 
     def __init__(self, saved: SavedMap, config: MapperConfig, start: Pose2 | None = None) -> None:
@@ -86,17 +86,19 @@ class LocalisationEstimator:
         self._evidence = EvidenceGrid(saved.grid)
         self._global = self._search_anew() if start is None else None
         self._tracking = start is not None
-        """Whether the place is known; while a search runs, it is being checked."""
+        """Whether the place is known; a search that still runs verifies it."""
         self._checked = 0.0
         """Distance travelled since the place was found (m)."""
         self._pose = np.array(start or (0.0, 0.0, 0.0))
         self._covariance = np.diag((0.2**2, 0.2**2, 0.1**2))
-        """Covariance of the pose from the matches alone; it sets the window of the next match."""
+        """Covariance of the pose from the matches alone, which sets the window of the next match."""
         self._published_covariance = self._covariance
-        """Published covariance: the predicted motion's for invalid matches and along a match's weak direction."""
+        """Published covariance: from the predicted motion for invalid matches and along a match's weak direction."""
         self._unmeasured = np.zeros(2)
-        """Standard deviation in map of the displacement since a match last measured the whole position, shape (2,) (m):
-        its errors do not average out, since wheels slip all along a corridor, and a velocity may have changed."""
+        """Standard deviation in map, shape (2,) (m), of the displacement since a match last measured the full position.
+
+        Its errors do not average out: wheels slip all along a corridor, and a velocity may have changed.
+        """
         self._stamp: int | None = None
         self._misfits = 0
         """Number of invalid matches in a row."""
@@ -144,7 +146,8 @@ class LocalisationEstimator:
                 self._scan_odometry.forget()
         else:
             match, status = self._track(scan, delta, (guess, covariance, published), mount)
-            # Without odometry, the first match after a corridor corrects the error made there: not a velocity.
+            # Without odometry, the first match after a corridor corrects the error made there; it does not measure a
+            # velocity.
             blind, self._blind = self._blind, match.degenerate
             if not blind or match.degenerate or self.odometry is OdometryUse.USED:
                 self._motion.learn(dt, delta, noise, between(self._pose, match.pose), match)
@@ -204,7 +207,7 @@ class LocalisationEstimator:
         matched = self._matched_alone if alone else self._matched
         match, good = matched(scan, delta, predicted, mount)
         if not good:
-            # The predicted motion may be wrong, from late odometry or from stamps that do not belong to the scans.
+            # The predicted motion may be wrong, because of late odometry or wrong stamps of scans.
             before = compose(guess, inverse(delta)), *predicted[1:]
             still, good = matched(scan, np.zeros(3), before, mount)
             # A partial fit near the prediction is better evidence than scans alone, but weaker than wheels.
@@ -213,10 +216,10 @@ class LocalisationEstimator:
         if match.accepted and not good and (not alone or _strayed(match, guess)):
             match = rejected(guess, covariance, MatchStatus.FAR)
         place, turn = deviations(match.covariance)
-        # New obstacles lower the overlap: only a pose with a large covariance starts a search.
+        # New obstacles lower the overlap: only a pose with a large covariance triggers a search.
         self._misfits = 0 if good else self._misfits + 1
         self.counts["rejected"] += not match.accepted
-        # Standard deviation that starts a search of the whole map (m, rad).
+        # Standard deviation that triggers a search of the whole map (m, rad).
         lost_deviation = (1.0, 0.5)
         if self._misfits >= 3 * LOST_AFTER or place > lost_deviation[0] or turn > lost_deviation[1]:
             self._global, self._tracking = self._search_anew(), False
@@ -226,7 +229,7 @@ class LocalisationEstimator:
         return match, LocalisationStatus.LOST if lost else status_of(match, LocalisationStatus.LOCALISED)
 
     def _matched_alone(self, scan: Scan, delta: Array, predicted: Predicted, mount: Pose2) -> tuple[ScanMatch, bool]:
-        """Match all beams: the motion is not known well enough to select those that end on mapped ground."""
+        """Match all beams, as the motion is too uncertain to select those that end on mapped ground."""
         match = self._match(scan, delta, predicted)
         contradiction = self._evidence.judge(match.pose, scan.points, np.array(mount[:2])).contradiction
         return match, fits(match) and contradiction <= MAX_CONTRADICTION
@@ -243,7 +246,8 @@ class LocalisationEstimator:
         seen = scan if whole else scan.chosen(mapped)
         match = self._match(seen, delta, predicted)
         contradiction = self._evidence.judge(match.pose, seen.points, sensor).contradiction
-        # Minimum overlap of the beams on mapped ground if others end elsewhere, and of a match far from the motion.
+        # Minimum overlap of the beams on mapped ground if others end elsewhere, and for a match far from the
+        # prediction.
         partial_overlap = 0.8
         # Maximum share of these beams that contradict the saved grid: a few walls fit in many places.
         partial_contradiction = 0.15
@@ -255,7 +259,7 @@ class LocalisationEstimator:
         return match, good and fits(match)
 
     def _unmeasured_step(self, match: ScanMatch, dt: float) -> Array:
-        """Return the standard deviation of the latest displacement, shape (2,) (m), by wheels or without them."""
+        """Return the standard deviation of the latest displacement, shape (2,) (m), with or without wheels."""
         if self.odometry is OdometryUse.USED:
             return np.asarray(self._config.odometry_distance * (match.pose[:2] - self._pose[:2]))
         if not match.degenerate or not match.accepted:
@@ -270,9 +274,9 @@ class LocalisationEstimator:
         return result
 
     def _match(self, scan: Scan, delta: Array, predicted: Predicted) -> ScanMatch:
-        """Match ``scan``; along its weak direction, wherever the prediction allows it to fit best.
+        """Match ``scan``, and search along the match's weak direction for the best fit within the prediction.
 
-        The match is degenerate if another place there fits as well.
+        The match is degenerate if another place in that direction fits as well.
         """
         guess, covariance, published = predicted
         match = self._front.match(scan, delta, guess, covariance, self._submap)
@@ -296,16 +300,16 @@ class LocalisationEstimator:
         return rejected(guess, covariance, MatchStatus.EMPTY), status
 
     def _found(self, scan: Scan, pose: Array, mount: Pose2) -> tuple[ScanMatch, LocalisationStatus]:
-        """Track from ``pose``; the search continues as a check."""
+        """Track from ``pose`` while the search continues as verification."""
         self._tracking, self._checked, self._misfits = True, 0.0, 0
         return self._track(scan, np.zeros(3), (pose, FOUND_COVARIANCE, FOUND_COVARIANCE), mount)
 
     def _refuted(self, pose: Array, found: Array | None, delta: Array) -> bool:
-        """Whether the check refutes ``pose``; the check ends when it has confirmed the place."""
+        """Whether the verification refutes ``pose``; it ends when it has confirmed the place."""
         assert self._global is not None
         self._checked += math.hypot(delta[0], delta[1])
         if (found is None or not _apart(pose, found)) and not self._global.outside:
-            # Distance after which the check ends (m): once it has confirmed the place, and without a confirmation.
+            # Distance after which the verification ends (m): after a confirmation, and without one.
             checked_way = (3.0, 9.0)
             if self._checked >= checked_way[0 if found is not None else 1]:
                 self._global = None
@@ -316,7 +320,7 @@ class LocalisationEstimator:
 
 
 def _far(pose: Array, guess: Array, covariance: Array) -> bool:
-    """Whether ``pose`` is further from ``guess`` than its ``covariance`` and a match's explain."""
+    """Whether ``pose`` is further from ``guess`` than its ``covariance`` and a match's covariance explain."""
     off = difference(pose, guess)
     distance = math.sqrt(float(off @ np.linalg.solve(covariance + MATCH_COVARIANCE, off)))
     far = 3.0  # standard deviations of the predicted pose beyond which a match is far from the motion
@@ -324,12 +328,12 @@ def _far(pose: Array, guess: Array, covariance: Array) -> bool:
 
 
 def _strayed(match: ScanMatch, guess: Array) -> bool:
-    """Whether a match is rejected or has left the place where it began."""
+    """Whether a match is rejected or far from the place of its prediction."""
     return not match.accepted or _apart(match.pose, guess)
 
 
 def _apart(one: Array, other: Array) -> bool:
-    """Whether two poses are of different places."""
+    """Whether two poses are at different places."""
     off = between(one, other)
     same_place = (0.5, 0.2)  # maximum difference of two poses of the same place (m, rad)
     return math.hypot(off[0], off[1]) > same_place[0] or abs(float(off[2])) > same_place[1]

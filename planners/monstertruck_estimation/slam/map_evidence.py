@@ -1,7 +1,7 @@
-"""Evidence of a saved grid for and against a pose: beams that end on its walls, cross them, or end in its free space.
+"""Evidence of a saved grid for or against a pose: beams that end on walls, cross them, or end in free space.
 
-The overlap of surfaces says only what fits. A room that looks like another one fits as well, but its beams pass where
-the map has walls, and end where the map is free (negative information: Thrun, Burgard, Fox, Probabilistic Robotics,
+The overlap of surfaces only shows what fits. A similar-looking room fits as well, but the robot's beams then pass
+through walls of the map, and end in its free space (negative information: Thrun, Burgard, Fox, Probabilistic Robotics,
 section 7.1).
 """
 
@@ -21,30 +21,30 @@ from monstertruck_runtime.map_files import FREE, OCCUPIED, WorldMap
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """Counts of beams; they add up."""
+    """Additive counts of beams."""
 
     agreeing: int = 0
-    """End at a wall."""
+    """Beams that end at a wall."""
     against: int = 0
-    """Cross a wall, or end in free space."""
+    """Beams that cross a wall, or end in free space."""
     unknown: int = 0
-    """End where the map knows nothing."""
+    """Beams that end in unknown cells."""
 
     def __add__(self, other: Self) -> "Evidence":
         return Evidence(self.agreeing + other.agreeing, self.against + other.against, self.unknown + other.unknown)
 
     @property
     def contradiction(self) -> float:
-        """Share of the beams that the map can check which contradict the pose, 0..1; 0 if it can check none."""
+        """Share of contradicting beams among those that the map can check, 0..1; 0 if there are none."""
         judged = self.agreeing + self.against
         return self.against / judged if judged else 0.0
 
 
 class EvidenceGrid:
-    """A saved grid with the distance of every cell from the nearest wall.
+    """Saved grid with the distance of every cell to the nearest wall.
 
     Args:
-        grid: the map.
+        grid: saved grid.
     """
 
     def __init__(self, grid: WorldMap) -> None:
@@ -54,20 +54,20 @@ class EvidenceGrid:
         self._far = np.asarray(far, np.float32) * np.float32(grid.resolution)
 
     def judge(self, pose: Array, points: Array, mount: Array) -> Evidence:
-        """Evidence of one scan.
+        """Return the evidence of one scan.
 
         Args:
-            pose: shape (3,), base in map, m and rad.
-            points: shape (n, 2), ends of beams in base, m.
-            mount: shape (2,), the sensor in base, m.
+            pose: base in map, shape (3,) (m, rad).
+            points: ends of the beams in base, shape (n, 2) (m).
+            mount: position of the sensor in base, shape (2,) (m).
         """
         kinds = self._kinds(pose, points, mount)
         return Evidence(*np.bincount(kinds, minlength=3).tolist())
 
     def judged(self, pose: Array, points: Array, mount: Array) -> NDArray[np.bool_]:
-        """Which beams the map can check, shape (n,): all but those that end where it knows nothing.
+        """Tell which beams the map can check, shape (n,): all but those that end in unknown cells.
 
-        Arguments are those of ``judge``.
+        The arguments are those of ``judge``.
         """
         return np.asarray(self._kinds(pose, points, mount) != UNJUDGED)
 
@@ -89,8 +89,8 @@ def _judged(cells, far, resolution, origin, sensor, points):  # type: ignore[no-
     for i in range(points.shape[0]):
         dx, dy = (points[i, 0] - sensor[0]) / resolution, (points[i, 1] - sensor[1]) / resolution
         reach = math.hypot(dx, dy)
-        tolerance = 0.15  # distance of a beam's end from a wall within which both agree, m
-        allowed = tolerance + 0.03 * reach * resolution  # added to that per metre of range, for the error of the yaw
+        tolerance = 0.15  # maximum distance between a beam's end and a wall that agree, m
+        allowed = tolerance + 0.03 * reach * resolution  # increase per metre of range, for the error of the yaw
         crossed = False
         for k in range(int(2 * (reach - allowed / resolution))):
             share = k / (2 * reach)

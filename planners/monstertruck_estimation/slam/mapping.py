@@ -54,7 +54,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.health import MATCHED, UNCERTAIN_DEVIATION, LocalisationStatus, OdometryUse
 
 SUSPECT_CONTRADICTION: Final = 0.03
-"""Maximum contradiction of scan and map where a similar-looking place is possible."""
+"""Maximum contradiction of scan and map if a similar-looking place is possible."""
 UNKNOWN: Final = np.diag((100.0**2, 100.0**2, math.pi**2))
 """Covariance of a lost robot's pose."""
 
@@ -67,13 +67,13 @@ class MappingEvent(StrEnum):
     CLOSED = "closed"
     PRUNED = "pruned"
     APART = "apart"
-    """The robot is lost: a submap that is not joined to the map was started."""
+    """The robot is lost, and starts a submap that is not joined to the map."""
     JOINED = "joined"
     """Two submaps were joined."""
     PARTED = "parted"
-    """Their join was wrong and is undone."""
+    """The join of two submaps was wrong and is undone."""
     CHANGED = "changed"
-    """What the map shows around the robot is gone, as on another floor."""
+    """The mapped surroundings of the robot are gone, as on another floor."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,15 +83,15 @@ class Step:
     stamp: int
     """Stamp of the scan (ns)."""
     pose: Array
-    """Base in map, shape (3,). It jumps at a loop closure; use odom and the next field where it must not."""
+    """Base in map, shape (3,). It jumps at a loop closure; use odom and the next field for a pose without jumps."""
     map_from_odom: Array | None
     """Pose of odom in map, shape (3,); None without odometry, and while lost."""
     covariance: Array
     """Covariance of ``pose`` against the map around it, shape (3, 3); ``UNKNOWN`` while lost."""
     match: ScanMatch
-    """Result of scan matching; its pose is from before a closure at this step."""
+    """Result of scan matching; its pose precedes a loop closure in this step."""
     scan: Scan
-    """Points as matched, deskewed."""
+    """Matched points, deskewed."""
     events: tuple[MappingEvent, ...] = ()
 
 
@@ -126,12 +126,12 @@ class Mapper:
 
     @property
     def lost(self) -> bool:
-        """Whether scans have not fitted the map for a while, or fit only a submap that is not joined to it."""
+        """Whether recent scans have not fitted the map, or fit only a submap that is not joined to it."""
         return self._loss.lost or not self.map.joined()[-1:].all()
 
     @property
     def twist(self) -> Twist2:
-        """Velocity of base over the last two scans (vx, vy, wz; m/s, rad/s), to deskew the next one."""
+        """Velocity of base over the last two scans (vx, vy, wz; m/s, rad/s), for deskewing the next one."""
         return self._motion.twist
 
     def step(
@@ -142,16 +142,16 @@ class Mapper:
         again: Callable[[Twist2], Scan] | None = None,
         period: float = 0.0,
     ) -> Step | None:
-        """Take one scan.
+        """Process one scan.
 
         Args:
             scan: points in base at ``stamp``, their motion distortion undone by odometry or by ``twist``.
             stamp: stamp of the scan (ns); a scan not later than the previous one is ignored (None).
             odom: pose of base in odom at ``stamp``, shape (3,); None predicts from the motion so far.
-            again: prepares the same scan for another velocity of the base (vx, vy, wz; m/s, rad/s): without odometry
-                the scan is deskewed by the motion of its first match and matched a second time.
-            period: time of a revolution of a sensor that turns evenly (s), however unevenly its scans are stamped (by
-                a busy host, say); 0 takes stamps as they are.
+            again: function that deskews the same scan with another velocity of the base (vx, vy, wz; m/s, rad/s).
+                Without odometry, the scan is deskewed with the motion of its first match, and matched a second time.
+            period: revolution time of an evenly turning sensor (s), for scans stamped unevenly (by a busy host, say); 0
+                uses the stamps.
         """
         if self._stamp is not None and stamp <= self._stamp:
             return None
@@ -203,17 +203,17 @@ class Mapper:
     def _best_match(
         self, scan: Scan, stamp: int, motion: tuple[Array, Array]
     ) -> tuple[Scan, tuple[Array, Array], ScanMatch]:
-        """Match after the predicted ``motion``, or after the first of the other predictions with a fit.
+        """Match the scan from the predicted ``motion``, or from the first alternative prediction that fits.
 
         Returns:
-            The scan, without moving points if the predicted motion is right; the motion, and the match after it.
+            Return the scan (without moving points if the predicted motion is right), the motion used, and its match.
         """
         match = self._matched(scan, *motion)
         still = self._still(scan, stamp, motion[0], match)
         if still is not scan:
             instead = self._matched(still, *motion, 1.0 - len(still) / len(scan))
             guess, covariance = _moved(self._pose, self._covariance, *motion)
-            # Of wheels that are wrong, walls seem to move: then the rest fits elsewhere.
+            # With wrong wheels, walls seem to move, and the remaining points then fit elsewhere.
             if fits(instead) and (fits(match) or off_guess(instead.pose, guess, covariance) <= LIKELY):
                 return still, motion, instead
         if fits(match) or self._submap is None:
@@ -244,11 +244,11 @@ class Mapper:
         most = PART_CONTRADICTION if suspect else CONTRADICTION
         if match.accepted and (off := self._motion.off(between(self._pose, match.pose))):
             # Maximum difference of a match from odometry, or from the last motion, if these may be wrong (m, rad).
-            # Every misfit enlarges the window of the next match, and the window of the last motion is wide: a robot
-            # that was carried fits somewhere in it sooner or later. The last motion corrects wheels that are late.
+            # Every misfit enlarges the window of the next match, and the window of the last motion is wide: sooner or
+            # later a carried robot fits somewhere within it. The last motion corrects late wheel readings.
             if exceeds(off, (0.5, 1.0)):
                 return rejected(guess, covariance, MatchStatus.FAR)
-            # Minimum difference of a match that may be at a similar-looking place: for doubtful and usual matches.
+            # Minimum difference of a match that may be at a similar-looking place: for doubtful and for usual matches.
             if exceeds(off, (0.1, 0.1) if self._loss.doubts(match) else (0.25, 0.25)):
                 suspect, most = True, SUSPECT_CONTRADICTION
         if (suspect or after_gap) and contradicts(self.map, scan, match.pose, most):
@@ -258,18 +258,18 @@ class Mapper:
         return match
 
     def _led(self, match: ScanMatch, delta: Array, guess: Array, covariance: Array) -> bool:
-        """Whether ``match`` is where the wheels led: at ``guess`` with its ``covariance``."""
+        """Whether ``match`` agrees with the wheels: with ``guess`` and its ``covariance``."""
         return match.accepted and self._motion.by_wheels(delta) and led_there(match, guess, covariance)
 
     def _extends(self, scan: Scan, match: ScanMatch, guess: Array, covariance: Array) -> bool:
-        """Whether ``match`` is where the motion led, and all misfitting points lie where the map has seen nothing."""
+        """Whether ``match`` agrees with the motion, and all misfitting points lie in unknown space."""
         if self._loss.after_gap or not match.accepted or match.degenerate or not self._loss.misfits(match):
             return False
         here = led_there(match, guess, covariance)
         return here and not contradicts(self.map, scan, match.pose, SUSPECT_CONTRADICTION)
 
     def finish(self) -> bool:
-        """Search for open submaps and remaining loop closures, register all keyframes jointly: seconds of work.
+        """Search for open submaps and remaining loop closures, then register all keyframes jointly: seconds of work.
 
         Returns:
             Whether the joint registration was kept (``KeyframeMap.refine``).
@@ -315,14 +315,14 @@ class Mapper:
         return max(way / self.config.key_distance, turned / self.config.key_turn)
 
     def _is_elsewhere(self, scan: Scan) -> bool:
-        """Whether a lost robot has left the place where its motion since the last fit led it."""
+        """Whether a lost robot has left the place that its motion since the last fit predicts."""
         if not len(self.map) or not enough(len(scan)) or not self._loss.lost:
             return False
         alone = self._motion.use is not OdometryUse.USED
         return alone or self._loss.after_gap or contradicts(self.map, scan, self._pose)
 
     def _begin_submap(self, scan: Scan, stamp: int) -> tuple[MappingEvent, ...]:
-        """Start a submap from the scans since the first misfit; undo joins in doubt, as they may be wrong."""
+        """Start a submap from the scans since the first misfit; undo joins in doubt, which may be wrong."""
         place = between(self.map.poses[-1], self._pose)
         change = self._relocation.part(self.map, self._closer)
         if change is not None:
@@ -336,7 +336,7 @@ class Mapper:
         return () if change is None else (MappingEvent(change),)
 
     def _searched(self) -> tuple[MappingEvent, ...]:
-        """Continue the searches for loops and for the places of submaps within the budget."""
+        """Continue the searches for loops and for places of submaps within the budget."""
         if not len(self.map):
             return ()
         poses, place = self.map.poses, between(self.map.poses[-1], self._pose)
@@ -409,18 +409,18 @@ class Estimator(Protocol):
     """Mapping, or localisation in a saved map, as run by the worker."""
 
     counts: dict[str, int]
-    """Numbers of scans, keyframes, closures, rejected matches."""
+    """Numbers of scans, keyframes, closures and rejected matches."""
 
     @property
     def twist(self) -> Twist2:
-        """Velocity of base by the last scans (m/s, rad/s)."""
+        """Velocity of base from the last scans (m/s, rad/s)."""
 
     @property
     def odometry(self) -> OdometryUse:
         """Whether the motion between scans is predicted by odometry."""
 
     def step(self, scan: Scan, inputs: ScanInput) -> SlamEstimate | None:
-        """Take a scan; return None if it is not later than the previous one."""
+        """Process a scan; return None if it is not later than the previous one."""
 
     def changes(self) -> tuple[list[GridPatch], bool]:
         """Return the tiles changed since the last call, and whether the grid was rebuilt."""
@@ -445,7 +445,7 @@ class Estimator(Protocol):
 
 
 class MappingEstimator:
-    """Mapper with its grid.
+    """Mapper with an occupancy grid.
 
     Args:
         mapper: noise models and limits.
@@ -469,9 +469,9 @@ class MappingEstimator:
         self._drawn: tuple[Array, Pose2] | None = None
         """Base in map and in odom at the latest scan, if it belongs to the grid."""
         self._apart: list[tuple[Scan, int, Pose2]] = []
-        """Keyframes that are not on the map: scan, stamp, mount."""
+        """Keyframes in submaps off the map: scan, stamp, mount."""
         self._doubtful: list[tuple[Scan, int, Pose2]] = []
-        """Keyframes on the map by a join that is in doubt."""
+        """Keyframes on the map through a join in doubt."""
         self._check = LidarCheck()
         self._scan_odometry = ScanOdometry()
 
@@ -545,7 +545,7 @@ class MappingEstimator:
         )
 
     def draw(self, scan: Scan, inputs: ScanInput) -> None:
-        """Add a scan of another lidar to the grid, where odometry since the latest scan places it."""
+        """Add a scan of another lidar to the grid, placed by odometry since the latest scan."""
         if self._drawn is not None and inputs.odom is not None:
             pose, odom = self._drawn
             there = compose(pose, between(np.array(odom), np.array(inputs.odom)))
@@ -587,7 +587,7 @@ class MappingEstimator:
         return joint
 
     def _draw_joined(self) -> None:
-        """Add to the grid the keyframes of submaps that waited until they were joined to the map."""
+        """Add the keyframes of submaps to the grid once they are joined to the map."""
         stamps, poses = self.mapper.trajectory()
         on_map, waiting, self._apart = self.mapper.on_map(), self._apart, []
         for scan, stamp, mount in waiting:
@@ -597,7 +597,7 @@ class MappingEstimator:
             (self._doubtful if on_map[k] else self._apart).append((scan, stamp, mount))
 
     def _withdraw_parted(self) -> None:
-        """Remove the contributions of a wrong join from the grid."""
+        """Remove the keyframes of a wrong join from the grid."""
         stamps, _ = self.mapper.trajectory()
         on_map = self.mapper.on_map()
         self._apart += [row for row in self._doubtful if not on_map[np.searchsorted(stamps, row[1])]]

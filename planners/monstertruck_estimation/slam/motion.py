@@ -1,4 +1,4 @@
-"""Motion of the base between two scans: predicted from odometry, measured by matching; the offset of their clocks."""
+"""Motion of base between two scans: predicted from odometry, measured by matching; and the offset of their clocks."""
 
 import math
 from collections import deque
@@ -33,18 +33,20 @@ def velocity(delta: Array, dt: float) -> Twist2:
 FEWEST_SAMPLES: Final = 2
 """Minimum number of steps of a comparison."""
 CONTRADICTIONS: Final = 2
-"""Number of comparisons in a row that must contradict odometry, by their last and by their first scans, before it is
-dropped: one scan with a late stamp contradicts nothing, wherever it lies."""
+"""Number of successive comparisons, by their last and by their first scans, that must contradict odometry to drop it.
+
+One scan with a late stamp must not suffice.
+"""
 
 
 class OdometryCheck:
-    """Compare distances and turns by odometry with the scans', which are independent of the wheels.
+    """Compare distances and turns by odometry with those by the scans, which are independent of the wheels.
 
-    The differences of their motions are summed over some seconds: clocks that disagree shift both a little and change
-    no sum. A slow robot is compared over as much motion as a fast one: within seconds alone its error would not exceed
-    a slack. A contradicted quantity, distances or turns, must agree step by step over 2 m or 2 rad before odometry is
-    used again: a turn of the wrong sign agrees as long as the robot drives straight. If distances are contradicted,
-    turns remain in use while they agree over everything compared, and the reverse.
+    The differences of their motions are summed over some seconds: disagreeing clocks shift both a little but change no
+    sum. A slow robot is compared over as much motion as a fast one: within seconds alone, its error would stay below
+    the tolerance. A contradicted quantity, distances or turns, must agree step by step over 2 m or 2 rad before
+    odometry is used again: a turn of the wrong sign agrees as long as the robot drives straight. If distances are
+    contradicted, turns remain in use while they agree over the whole comparison, and the reverse.
     """
 
     def __init__(self) -> None:
@@ -57,11 +59,11 @@ class OdometryCheck:
         self._kept = np.ones(2, bool)
         self._agreed = np.zeros((2, 2))
         self.since = 0.0
-        """Start of the contradiction, in seconds before the latest scan."""
+        """Start of the contradiction (s before the latest scan)."""
 
     @property
     def contradicted(self) -> bool:
-        """Whether distances or turns by odometry are wrong."""
+        """Whether distances, or turns, by odometry are wrong."""
         return bool(self._wrong.any())
 
     @property
@@ -71,16 +73,16 @@ class OdometryCheck:
         return way, turn
 
     def add(self, dt: float, odom: Array, moved: Array, *, seen: bool = True) -> None:
-        """Take the motions in base over ``dt`` seconds, shape (3,), by odometry and by the scans.
+        """Add the motions in base over ``dt`` seconds, shape (3,), by odometry and by the scans.
 
-        If the scans have not ``seen`` the distance (a corridor), it neither contradicts nor agrees with anything.
+        If the scans have not ``seen`` the distance (in a corridor), it is not compared.
         """
         self._seconds += dt
         self._odom, self._scans = compose(self._odom, odom), compose(self._scans, moved)
         self._seen &= seen
         step = np.array((self._seconds, *self._odom, *self._scans, self._seen))
-        # Minimum length of a comparison step, in seconds and motion: the noise of single matches would add up to a
-        # distance.
+        # Minimum length of a comparison step, in seconds and motion: otherwise the noise of single matches would add up
+        # to a distance.
         sample = (0.25, 0.1)
         if self._seconds < sample[0] or _motion(step) < sample[1]:
             return
@@ -101,16 +103,17 @@ class OdometryCheck:
         return sum(float(step[0]) for step in later) > compared[0] and sum(map(_motion, later)) > compared[1]
 
     def _judge(self) -> None:
-        """Compare over at least the last ``FEWEST_SAMPLES`` steps; drop odometry, or use it again."""
+        """Compare over at least the last ``FEWEST_SAMPLES`` steps; drop odometry or readmit it."""
         rows = np.array(self._steps)[::-1]
         differences = np.cumsum(rows[:, 1:4] - rows[:, 4:7], axis=0)
         off = np.stack((np.hypot(differences[:, 0], differences[:, 1]), np.abs(differences[:, 2])), axis=1)
         lengths = np.stack((_lengths(rows[:, 1:4]), _lengths(rows[:, 4:7])))
         seen = np.stack((rows[:, 7], np.ones(len(rows))), axis=1)
         motion = np.cumsum(lengths, axis=1).max(axis=0)
-        # Tolerated difference of the distance per radian (m), and of the turn per metre (rad): levers, unequal wheels.
+        # Tolerated difference of the distance per radian (m), and of the turn per metre (rad): lever arms, unequal
+        # wheels.
         crossed = 0.1
-        # Tolerated for an offset of the clocks: 0.1, and at most 0.2 including crossed motion (m, rad).
+        # Tolerance for an offset of the clocks: 0.1, and at most 0.2 including crossed motion (m, rad).
         slack = np.minimum(0.1 + crossed * motion[:, ::-1], 0.2)
         tolerance = 0.3  # tolerated difference of odometry and scans as a share of the distance, or of the turn
         beyond = (off > tolerance * motion + slack)[FEWEST_SAMPLES - 1 :]
@@ -119,7 +122,7 @@ class OdometryCheck:
         if self._row >= CONTRADICTIONS:
             if not self.contradicted:
                 self.since = float(rows[:, 0].sum())
-                # Wheels without information agree with nothing.
+                # Wheels without information agree with no scan.
                 self._kept = off[-1] < tolerance * (lengths * seen).sum(axis=1).min(axis=0)
             self._wrong |= wrong
             self._kept &= ~wrong
@@ -128,8 +131,8 @@ class OdometryCheck:
             by_odometry, by_scans = lengths[:, 0]
             error = abs(by_odometry[0] - by_scans[0]), abs(rows[0, 3] - rows[0, 6])
             self._agreed += np.stack((np.maximum(by_odometry, by_scans), error), axis=1) * seen[0][:, None]
-            agreement = 0.4  # mean error of a step, as a share of the motion, below which odometry is used again
-            agreed = (2.0, 2.0)  # motion with that agreement after which odometry is used again, m and rad
+            agreement = 0.4  # maximum mean error of a step, as a share of the motion, for readmitting odometry
+            agreed = (2.0, 2.0)  # motion over which it must agree before it is readmitted, m and rad
             enough, good = self._agreed[:, 0] >= agreed, self._agreed[:, 1] <= agreement * self._agreed[:, 0]
             self._agreed[enough & ~good] = 0.0
             self._wrong &= ~(enough & good)
@@ -149,11 +152,11 @@ def _motion(step: Array) -> float:
 
 
 class LastMotionPredictor:
-    """Predict the motion between two scans from the last ones, without odometry.
+    """Predict the motion between two scans from the last motions, without odometry.
 
-    The prediction keeps either the velocity or the motion from scan to scan. A busy host stamps evenly made scans in
-    bursts, none for a second and then several at once, or in the wrong order; by such stamps, a steady robot would
-    stand and leap. The motion from scan to scan is used if its errors were clearly smaller.
+    The prediction keeps either the velocity or the motion per scan. A busy host stamps evenly made scans in bursts
+    (none for a second and then several at once) or in the wrong order; with such stamps, a robot in steady motion would
+    seem to stop and leap. The motion per scan is used if its errors were clearly smaller.
 
     Args:
         config: initial noise.
@@ -162,12 +165,12 @@ class LastMotionPredictor:
     def __init__(self, config: MapperConfig) -> None:
         self._config = config
         self._times: deque[float] = deque(maxlen=NOISE_MEMORY)
-        steps = 3  # number of motions whose median is kept from scan to scan
+        steps = 3  # number of motions in the median motion per scan
         self._steps: deque[tuple[float, Array]] = deque(maxlen=steps)
         self._predictions = np.zeros((2, 3))
-        """Predictions by the velocity, and from scan to scan."""
+        """Predictions from the velocity and from the motion per scan."""
         self._errors = np.zeros(2)
-        """Mean squares of their errors; a radian weighs as much as a metre."""
+        """Mean squares of their errors; one radian has the weight of one metre."""
         self._accepted = False
 
     def predict(self, dt: float) -> tuple[Array, Array]:
@@ -178,8 +181,7 @@ class LastMotionPredictor:
             max_stretch = 3.0  # maximum factor by which a pause lengthens the last motion
             lasting = last * (min(dt / before, max_stretch) if before > 0 else 0.0)
             self._predictions = np.stack((lasting, np.median([step for _, step in self._steps], axis=0)))
-        # Maximum share of the velocity's mean squared error for using the motion from scan to scan: half
-        # as far off.
+        # Maximum share of the velocity's mean squared error for using the motion per scan: half the error.
         clearly = 0.25
         from_scan_to_scan = bool(self._errors[1] < clearly * self._errors[0])
         # If stamps do not measure the time, at least the usual time has passed.
@@ -189,7 +191,7 @@ class LastMotionPredictor:
         return self._predictions[int(from_scan_to_scan)], np.diag((place**2, place**2, turn**2))
 
     def learn(self, dt: float, moved: Array, match: ScanMatch) -> None:
-        """Take the motion ``moved``, shape (3,), in ``dt`` seconds by the match."""
+        """Add the motion ``moved``, shape (3,), in ``dt`` seconds, as measured by the match."""
         before, self._accepted = self._accepted, match.accepted
         # The first motion after a misfit corrects the wrong prediction at the misfit.
         if not (before and match.accepted):
@@ -201,16 +203,17 @@ class LastMotionPredictor:
 
 
 def _is_clear(match: ScanMatch) -> bool:
-    """Whether a match measures the motion without the prediction's help."""
-    clear_match = (0.15, 0.75)  # minimum degeneracy and overlap of a match that is compared with odometry
+    """Whether a match measures the motion independently of the prediction."""
+    clear_match = (0.15, 0.75)  # minimum degeneracy and overlap of a match for a comparison with odometry
     return match.degeneracy >= clear_match[0] and match.overlap >= clear_match[1]
 
 
 class MotionPredictor:
     """Predict the motion between two scans, adapt the noise of odometry to the matches, and drop wrong odometry.
 
-    Wheels slip, and many logs stamp odometry and scans by different clocks; no constant fits all. The factors
-    follow the root mean square of the innovations (adaptive Kalman filtering, Mehra 1972), of distances and of turns.
+    Wheels slip, and many logs stamp odometry and scans with different clocks, so no constant noise fits all. The
+    factors follow the root mean square of the innovations (adaptive Kalman filtering, Mehra 1972) of distances and
+    turns.
 
     Args:
         config: initial noise.
@@ -223,7 +226,7 @@ class MotionPredictor:
         self._by_odometry: tuple[Array, Array] | None = None
         """Motion by odometry with the wheels' scale, and its covariance."""
         self._raw = np.zeros(3)
-        """The same motion as odometry states it."""
+        """The same motion unchanged by the scale."""
         self._scale = WheelScale(config.odometry_distance, config.odometry_floor[0])
         self._alone = LastMotionPredictor(config)
         self._by_motion = np.zeros(3), np.zeros((3, 3))
@@ -254,8 +257,8 @@ class MotionPredictor:
     def others(self) -> tuple[tuple[Array, Array], ...]:
         """Return the predictions that ``predict`` did not choose, and their covariances; none without odometry.
 
-        The scans' own motion is always among all the predictions: wheels with only valid distances or only valid turns
-        may still be wrong at one scan, and would then lose a robot that scans alone do not lose.
+        The predictions always include the scans' own motion: wheels with only valid distances or only valid turns may
+        still be wrong at one scan, and would then lose a robot that scans alone would not lose.
         """
         if self._by_odometry is None:
             return ()
@@ -264,7 +267,7 @@ class MotionPredictor:
         return (self._by_motion, self._by_odometry) if any(self.check.kept) else (self._by_odometry,)
 
     def by_wheels(self, delta: Array) -> bool:
-        """Whether ``delta``, shape (3,), is the motion by odometry, and nothing contradicts it."""
+        """Whether ``delta``, shape (3,), is the motion by odometry, without contradiction."""
         return self.use is OdometryUse.USED and self._by_odometry is not None and delta is self._by_odometry[0]
 
     @property
@@ -312,16 +315,16 @@ class MotionPredictor:
         return np.diag((place**2, place**2, turn**2))
 
     def _moving(self, delta: Array) -> float:
-        """Return the share of the minimum noise that the motions by odometry and by the latest scan explain.
+        """Return the share of the minimum noise that is due to the motions by odometry and by the latest scan.
 
-        Late stamps and slip are errors of a motion: wheels of a robot that stands are exact, and the scans show it.
+        Late stamps and slip cause errors only during motion: at standstill wheels are exact, and the scans show it.
         """
-        still = 0.01  # share of a robot that stands: the resolution of its encoders
+        still = 0.01  # share at standstill: the resolution of the encoders
         motion = (_lengths(np.stack((delta, self._delta))) / self._config.odometry_floor).max()
         return float(np.clip(motion, still, 1.0))
 
     def off(self, moved: Array) -> tuple[float, float] | None:
-        """Return the difference of ``moved``, shape (3,), from odometry or from the last motion, if that is nearer.
+        """Return the difference of ``moved``, shape (3,), from odometry or from the last motion, whichever is nearer.
 
         Returns:
             Difference beyond two standard deviations of odometry (m, rad); None if odometry is not in use.
@@ -345,7 +348,7 @@ class MotionPredictor:
             self._scale.interrupt()
             return
         by_odometry = self._by_odometry[0]
-        # Along a corridor the match takes the distance from the prediction; only its turn is measured.
+        # Along a corridor, the match takes the distance from the prediction and measures only the turn.
         compared = (*self._raw[:2], moved[2]) if match.degenerate else moved
         self.check.add(dt, self._raw, np.array(compared), seen=not match.degenerate)
         if self.check.contradicted:
@@ -357,16 +360,16 @@ class MotionPredictor:
         if not _is_clear(match) or delta is not by_odometry:
             return
         off = between(delta, moved)
-        fit_noise = (0.01, 0.005)  # standard deviation of a match itself, m and rad
+        fit_noise = (0.01, 0.005)  # standard deviation of a single match, m and rad
         place = (off[0] ** 2 + off[1] ** 2) / 2 / (noise[0, 0] + fit_noise[0] ** 2)
         turn = off[2] ** 2 / (noise[2, 2] + fit_noise[1] ** 2)
-        max_innovation = 4.0  # limit to which normalised innovations are clamped
+        max_innovation = 4.0  # limit of normalised innovations
         innovations = np.minimum((place, turn), max_innovation**2) * np.square(self.factors)
         self._squares += (innovations - self._squares) / NOISE_MEMORY
 
 
 UNCONSTRAINED: Final = np.diag((1e-4, 1e-4, 1e-2))
-"""Added to every information: an unconstrained direction has a standard deviation of 100 m, or of 10 rad."""
+"""Added to every information matrix: unconstrained directions get a standard deviation of 100 m or 10 rad."""
 
 
 class UsualOverlap:
@@ -381,16 +384,16 @@ class UsualOverlap:
         return self._mean - 0.15
 
     def take(self, overlap: float) -> None:
-        """Take the overlap of a good match."""
+        """Add the overlap of a good match."""
         self._mean += (overlap - self._mean) * (0.05 if self._mean else 1.0)
 
 
 class ScanOdometry:
-    """Scan odometry: the motion between successive matches, by the scans alone.
+    """Scan odometry: motion between successive matches from the scans alone.
 
-    With odometry, only matches of good overlap give a motion, and none is given across a rejected match: the robot may
-    have been carried, and a partial fit at a wrong place must not be used before the overlap is back at its mean.
-    Without odometry, rejected matches are skipped, and every accepted one is used.
+    With odometry, only matches with good overlap give a motion, and none across a rejected match: the robot may have
+    been carried, and a partial fit at a wrong place must not be used before the overlap is back at its mean. Without
+    odometry, rejected matches are skipped, and every accepted one is used.
     """
 
     def __init__(self) -> None:
@@ -401,14 +404,14 @@ class ScanOdometry:
     def take(
         self, stamp: int, match: ScanMatch, pose: Array, *, alone: bool, corrected: bool = False
     ) -> ScanIncrement | None:
-        """Return the motion since the last match that was used; None if this one is not.
+        """Return the motion since the last used match; None if this one is not used.
 
         Args:
             stamp: stamp of the scan (ns).
             match: result of scan matching; its covariance includes the prediction, its information does not.
-            pose: pose after the step, in which a loop may have been closed, shape (3,).
-            alone: there is no odometry.
-            corrected: a loop closure moved the map at this step: the next motion begins at ``pose``.
+            pose: pose after the step, including a loop closure in it, shape (3,).
+            alone: whether there is no odometry.
+            corrected: whether a loop closure moved the map in this step; the next motion then starts at ``pose``.
         """
         if match.information is None or not (alone or match.overlap >= self._least):
             self._least = max(LOW_OVERLAP, self._usual.least)
@@ -432,12 +435,12 @@ class ScanOdometry:
         return ScanIncrement(since, (x, y, yaw), tuple(covariance.ravel().tolist()))
 
     def forget(self) -> None:
-        """Restart: the next match has no predecessor."""
+        """Restart without a previous match."""
         self._last, self._least = None, LOW_OVERLAP
 
 
 def constrained(match: ScanMatch, information: Array) -> Array:
-    """Return the ``information``, shape (3, 3), of a match; if degenerate, without its weak direction's component.
+    """Return the ``information``, shape (3, 3), of a match, without the weak direction's component if degenerate.
 
     That component comes from the ends of the visible walls, which move along with the robot.
     """
@@ -463,20 +466,20 @@ OFFSET_LEAST_SCANS: Final = 120
 
 
 class ClockOffsetEstimator:
-    """Estimate a constant offset between the clocks of odometry and scans, as found in logs with badly stamped wheels.
+    """Estimate a constant offset between the clocks of odometry and scans, as in logs with badly stamped wheels.
 
-    The yaw rate of the matches is correlated with odometry's yaw rate at shifted times; the lag of the best
-    correlation is the offset. Only the yaw is used: both measure it best.
+    The matches' yaw rate is correlated with odometry's at shifted times; the lag with the best correlation is the
+    offset. Only the yaw is used: both sources measure it best.
     """
 
     def __init__(self) -> None:
-        self._samples: deque[tuple[int, float, float]] = deque(maxlen=300)  # number of scans compared
+        self._samples: deque[tuple[int, float, float]] = deque(maxlen=300)  # number of compared scans
         self._seen = 0
         self.offset: float | None = None
         """Lead of odometry over the scans (s); None if unknown or zero."""
 
     def add(self, stamp: int, matched: float, odom: float) -> None:
-        """Take the yaw of an accepted match and of odometry (rad) at ``stamp`` (ns); ignore them unless finite."""
+        """Add the yaw of an accepted match and of odometry (rad) at ``stamp`` (ns); both are ignored unless finite."""
         if not math.isfinite(odom):
             return
         self._samples.append((stamp, matched, odom))
@@ -496,7 +499,7 @@ def find_offset(stamps: Array, matched: Array, odom: Array) -> float | None:
     """
     times = (stamps - stamps[0]) / SECOND
     wheel, scan = np.unwrap(odom), np.unwrap(matched)
-    offset_lags = np.arange(-12, 13) * 0.05  # offsets tried, s
+    offset_lags = np.arange(-12, 13) * 0.05  # tried offsets, s
     margin = float(offset_lags[-1])
     inside = (times[:-1] >= margin) & (times[1:] <= times[-1] - margin)
     steps = np.diff(times)[inside]
@@ -517,7 +520,7 @@ def find_offset(stamps: Array, matched: Array, odom: Array) -> float | None:
     # Neighbouring scans have correlated errors, blocks of them do not.
     blocks = np.add.reduceat(residuals * slopes, np.arange(0, len(slopes), 20))
     deviation = float(np.linalg.norm(blocks)) / max(float(slopes @ slopes), 1e-9)
-    # Interpolation between scans smooths odometry, which makes shifts by half of their period likely.
+    # Interpolation between scans smooths odometry, which favours shifts by half of their period.
     smoothing = float(np.median(np.diff(times))) / 2.0
     return -lag if abs(lag) > max(smoothing, 3.0 * deviation) else None
 

@@ -1,9 +1,9 @@
 """Estimate of the lidar's mount beside the map: motions of the wheels against those of the scans.
 
-Wheels measure motion in the robot's axes, scans in the axes of the lidar. A lidar that is turned by an angle against
-its mount sees every motion turned by that angle the other way, and the map is none the worse for it; one that hangs
-upside down sees every turn reversed. With the lidar's pose X in its configured place, A X = X B for motions A of the
-wheels and B of the scans (Tsai and Lenz 1989): linear in its yaw, in the scale of the wheels, and in its displacement.
+Wheels measure motion in the robot's axes, scans in the lidar's. If the lidar is rotated against its configured mount,
+every motion by the scans is rotated the other way, while the map stays consistent; if it hangs upside down, every turn
+is reversed. With the lidar's pose X in its configured mount, A X = X B for motions A of the wheels and B of the scans
+(Tsai and Lenz 1989): linear in its yaw, in the scale of the wheels, and in its displacement.
 """
 
 import math
@@ -22,23 +22,23 @@ from monstertruck_kinematics.se2 import between, wrap
 from monstertruck_schemas.health import OdometryUse
 
 LEAST_YAW: Final = math.radians(1.5)
-"""A lidar is fitted by hand to about this: in recorded logs (Intel, ACES, CSAIL) it is off by 0.4 to 1.2 degrees."""
+"""Accuracy of a lidar mounted by hand: in recorded logs (Intel, ACES, CSAIL) it is off by 0.4 to 1.2 degrees."""
 
 
 @dataclass(frozen=True, slots=True)
 class MountEstimate:
-    """Difference of the lidar's mount from the configured one."""
+    """Deviation of the lidar's mount from its configuration."""
 
     yaw: float
-    """Yaw of the lidar relative to its mount, rad."""
+    """Yaw of the lidar relative to its mount (rad)."""
     deviation: float
-    """Standard deviation of ``yaw``, rad."""
+    """Standard deviation of ``yaw`` (rad)."""
     mirrored: bool
     """Whether the scans turn against odometry."""
 
     @property
     def fault(self) -> str | None:
-        """Fault of the mount, and the remedy; None if none is certain."""
+        """Return the fault of the mount and its remedy; None without a certain fault."""
         if self.mirrored:
             return "scans turn against odometry: the lidar hangs upside down, or its beams run the other way"
         sure = 3.0  # standard deviations
@@ -49,10 +49,10 @@ class MountEstimate:
 
 
 class MountEstimator:
-    """Estimate the mount from stretches of a path.
+    """Estimate the mount from stretches of the path.
 
     Args:
-        most: number of stretches used, the latest ones; None for all.
+        most: maximum number of stretches used, the latest ones; None for all.
     """
 
     def __init__(self, most: int | None = None) -> None:
@@ -61,25 +61,25 @@ class MountEstimator:
         self._estimate: MountEstimate | None = None
 
     def add(self, odom: Array | None, pose: Array) -> None:
-        """Take base in odom and in map at a scan, shape (3,) each; without finite odometry a new stretch begins."""
+        """Add base in odom and in map at a scan, shape (3,) each; non-finite odometry ends the stretch."""
         if odom is None or not np.isfinite(odom).all():
             self.interrupt()
         elif self._begin is None:
             self._begin = odom, pose
         else:
             moved = between(self._begin[0], odom)
-            stretch = 0.3  # distance by odometry over which both motions are compared, m: a match is known to 1 or 2 cm
+            stretch = 0.3  # distance by odometry for a comparison of both motions, m: a match is accurate to 1 or 2 cm
             if math.hypot(moved[0], moved[1]) >= stretch:
                 self._stretches.append((moved, between(self._begin[1], pose)))
                 self._begin, self._estimate = (odom, pose), None
 
     def interrupt(self) -> None:
-        """Begin a new stretch: poses have been corrected, or are unknown."""
+        """Begin a new stretch after poses were corrected or unknown."""
         self._begin = None
 
     @property
     def estimate(self) -> MountEstimate | None:
-        """Latest estimate; None if there are too few stretches."""
+        """Return the latest estimate; None with too few stretches."""
         if self._estimate is None and len(self._stretches) >= 10:  # minimum number of stretches
             by_wheels, by_scans = (np.array(motions) for motions in zip(*self._stretches, strict=True))
             self._estimate = estimated(by_wheels, by_scans)
@@ -100,12 +100,12 @@ class LidarCheck:
 
     @property
     def mount_fault(self) -> str | None:
-        """Fault of the lidar's mount, and the remedy; None if none is certain."""
+        """Fault of the lidar's mount and its remedy; None without a certain fault."""
         found = self._mount.estimate
         return None if found is None else found.fault
 
     def add(self, stamp: int, pose: Array, odom: Array | None, use: OdometryUse) -> None:
-        """Take base in map by the scan at ``stamp`` (ns), and in odom, shape (3,) each, and what odometry is used for.
+        """Add base in map by the scan at ``stamp`` (ns) and in odom, shape (3,) each, and the use of odometry.
 
         A wrong mount contradicts odometry, too.
         """
@@ -124,12 +124,12 @@ def estimated(by_wheels: Array, by_scans: Array) -> MountEstimate:
     if mirrored:
         by_scans = by_scans * (1.0, -1.0, -1.0)
     seen = by_scans[:, 0] + 1j * by_scans[:, 1]
-    # The turn is taken from the scans, which measure it best: half of it turns the chord of a stretch.
+    # The turn is taken from the scans, which measure it best; half of it turns the chord of a stretch.
     driven = (by_wheels[:, 0] + 1j * by_wheels[:, 1]) * np.exp(0.5j * wrap(by_scans[:, 2] - by_wheels[:, 2]))
     levers = np.column_stack((driven, np.exp(1j * by_scans[:, 2]) - 1.0))
     displaced = 0.05  # standard deviation of the lidar's displacement from its mount, m
     weights, found, normal = np.ones(len(seen)), np.zeros(2, complex), np.eye(2, dtype=complex)
-    errors, noise = seen, 0.01  # standard deviation of a stretch's motion before it is known, m
+    errors, noise = seen, 0.01  # standard deviation of a stretch's motion before it is estimated, m
     for _ in range(5):  # iterations of the reweighting: slip and wrong matches are outliers
         normal = (levers.conj().T * weights) @ levers + np.diag((0.0, (noise / displaced) ** 2))
         found = np.linalg.solve(normal, (levers.conj().T * weights) @ seen)
@@ -147,11 +147,11 @@ def mount_of(scans: Sequence[ScanInput], trajectory: tuple[NDArray[np.int64], Ar
     """Estimate the mount from a whole log.
 
     Args:
-        scans: scans of the log, with odometry where it has any.
-        trajectory: stamps (n,), ns, and poses (n, 3) by the scans.
+        scans: scans of the log, with odometry if available.
+        trajectory: stamps (n,) (ns) and poses (n, 3) by the scans.
 
     Returns:
-        None if there are too few stretches of odometry.
+        None with too few stretches of odometry.
     """
     odometry = {scan.stamp: scan.odom for scan in scans}
     estimator = MountEstimator()

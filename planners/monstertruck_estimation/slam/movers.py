@@ -1,9 +1,8 @@
-"""Detection of people and robots that move: comparison of a scan with one about a second older.
+"""Detection of moving people and robots by comparing a scan with one about a second older.
 
-A crowd that walks along fits itself best where it stood before, so it drags the match with it, most of all in a
-corridor, where walls do not constrain the motion ahead. A point moves if an older scan looked through its place, or if
-what hid its place has left since. A thing that moves is narrow: a whole wall that seems to move contradicts odometry,
-and stays.
+A crowd that walks along fits best at its previous place, so it drags the match along, especially in a corridor, whose
+walls do not constrain the motion ahead. A point moves if an older scan looked through its place, or if the object that
+hid its place has left. Moving objects are narrow: a whole wall that seems to move contradicts odometry, and is kept.
 """
 
 import math
@@ -23,46 +22,46 @@ from monstertruck_runtime.clock import SECOND
 Marks = NDArray[np.bool_]
 
 SECTORS: Final = 360
-"""Directions of a view."""
+"""Number of sectors of a view."""
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A scan as the detector keeps it."""
+    """Scan as stored by the detector."""
 
     points: Array
-    """Shape (n, 2), in base, m."""
+    """Points in base, shape (n, 2) (m)."""
     limits: Array
-    """Shape (SECTORS,): least range of each sector and its neighbours, m; 0 where nothing was met."""
+    """Minimum range of each sector and its neighbours, shape (SECTORS,) (m); 0 without points."""
     owners: NDArray[np.int64]
-    """Shape (SECTORS,): the points that these ranges belong to."""
+    """Points to which these ranges belong, shape (SECTORS,)."""
 
     @classmethod
     def of(cls, points: Array) -> "View":
-        """The view of ``points``, shape (n, 2)."""
+        """Return the view of ``points``, shape (n, 2)."""
         return cls(points, *_nearest(points))
 
 
 class MoverDetector:
-    """Removes from every scan the points that moved since a scan about a second older.
+    """Remove from every scan the points that moved since a scan about a second older.
 
-    Scans are compared by the distances of odometry and the turns of the matches: people hardly turn a match, and wheels
-    turn worse than they roll.
+    Scans are compared with the distances of odometry and the turns of the matches: people hardly affect the turn of a
+    match, and wheels measure turns worse than distances.
     """
 
     def __init__(self) -> None:
         self._views: deque[tuple[int, Array, View]] = deque()
-        """Stamp, pose of base, shape (3,), and view of the scans kept."""
+        """Stamp, pose of base, shape (3,), and view of the stored scans."""
         self._pose = np.zeros(3)
         self._newest: tuple[int, Array, View] | None = None
-        """Stamp, motion before it and view of the scan that ``settle`` keeps."""
+        """Stamp, preceding motion and view of the scan that ``settle`` stores."""
 
     def still(self, stamp: int, delta: Array | None, turn: float, scan: Scan) -> Scan:
-        """Return ``scan`` without the points that move.
+        """Return ``scan`` without moving points.
 
         Args:
             stamp: stamp of the scan, ns.
-            delta: shape (3,), motion of base since the scan before by odometry; None without trusted odometry.
+            delta: motion of base since the previous scan by odometry, shape (3,); None without trusted odometry.
             turn: turn of base since then by the match of the whole scan, rad.
             scan: points in base.
         """
@@ -70,8 +69,8 @@ class MoverDetector:
             self._views.clear()
             self._newest = None
             return scan
-        # Age of the scan that a new one is compared with, s: in the former a slow walker moves 0.2 m, and wheels
-        # measure longer times less well than clutter is apart.
+        # Age of the compared scan, s: in a shorter time a slow walker moves less than 0.2 m, and over a longer time the
+        # error of the wheels exceeds the spacing of clutter.
         least, most = 0.8, 1.2
         view = View.of(scan.points)
         self._newest = stamp, delta, view
@@ -86,7 +85,7 @@ class MoverDetector:
         return scan.chosen(~marks) if marks.any() else scan
 
     def settle(self, turn: float) -> None:
-        """Keep the latest scan; ``turn`` is the rotation of base before it by the match, rad."""
+        """Store the latest scan; ``turn`` is the preceding rotation of base by the match (rad)."""
         if self._newest is None:
             return
         stamp, delta, view = self._newest
@@ -95,9 +94,9 @@ class MoverDetector:
 
 
 def moved(view: View, before: View, motion: Array) -> Marks:
-    """Return which points of ``view``, shape (n,), are where ``before`` looked through, or behind an object that left.
+    """Mark points of ``view``, shape (n,), where ``before`` looked through or an object in front has left.
 
-    ``motion``, shape (3,), is the motion of base between both, m and rad.
+    ``motion``, shape (3,), is the motion of base between both (m, rad).
     """
     marks: Marks
     marks, hidden, sectors = _sights(before.limits, transform(motion, view.points))
@@ -107,15 +106,15 @@ def moved(view: View, before: View, motion: Array) -> Marks:
 
 
 def narrow(points: Array, marks: Marks) -> Marks:
-    """The marked ones of ``points``, shape (n, 2), in the order of the beams, that form things of 0.8 m at most.
+    """Return the marked ones of ``points``, shape (n, 2), in beam order, that form objects of at most 0.8 m.
 
-    Wider things stay: a wall that seems to move contradicts odometry.
+    Wider objects stay: a wall that seems to move contradicts odometry.
     """
     numbers = np.flatnonzero(marks)
     if not len(numbers):
         return marks
     chosen = points[numbers]
-    # Neighbouring points of one thing are this far apart at most, m and per metre of range.
+    # Maximum distance of neighbouring points of one object, m and per metre of range.
     apart, share = 0.25, 0.02
     breaks = np.hypot(*np.diff(chosen, axis=0).T) > apart + share * np.hypot(chosen[1:, 0], chosen[1:, 1])
     things = np.append(0, np.cumsum(breaks))
@@ -133,7 +132,7 @@ def _sector(x, y):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
 
 @njit(cache=True)
 def _nearest(points):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
-    """Limits and owners of a ``View``."""
+    """Return ranges and owners of a ``View``."""
     ranges, owners = np.full(SECTORS, np.inf), np.zeros(SECTORS, np.int64)
     for i in range(points.shape[0]):
         k, r = _sector(points[i, 0], points[i, 1]), math.hypot(points[i, 0], points[i, 1])
@@ -152,8 +151,8 @@ def _nearest(points):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
 
 @njit(cache=True)
 def _sights(limits, points):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
-    """Whether the view of ``limits`` looks through each of ``points``, shape (n,), or hides it, and its sector."""
-    # Difference of range within which two points are one, m and per metre: noise, and the error of odometry.
+    """Tell for each of ``points``, shape (n,), whether ``limits`` look through it or hide it, and its sector."""
+    # Maximum range difference of two observations of one point, m and per metre: noise, and the error of odometry.
     margin, slack = 0.1, 0.03
     through, hidden = np.zeros(points.shape[0], np.bool_), np.zeros(points.shape[0], np.bool_)
     sectors = np.zeros(points.shape[0], np.int64)

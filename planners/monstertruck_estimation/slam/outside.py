@@ -1,4 +1,4 @@
-"""Off-board localisation: pose in map from odometry and the corrections that clients send."""
+"""Off-board localisation: pose in map from odometry and corrections sent by clients."""
 
 import asyncio
 
@@ -28,20 +28,20 @@ from monstertruck_schemas.state import GateState, Odometry, Transform
 class OutsideLocalisation:
     """Follow odometry with the latest correction of one client, which must renew it within its lease.
 
-    Requests are checked like drive requests: nonce, sequence, age and role of the sender. While one source's lease
-    runs, corrections of others are refused. Without corrections the pose continues by odometry with status lost.
+    Requests are checked like drive requests: nonce, sequence, age and role of the sender. During the lease of one
+    source, corrections of others are refused. Without corrections, the pose continues by odometry with status lost.
 
     Args:
-        config: slew, jump and deviation.
-        clock: time.
+        config: rate limit, jump and deviation.
+        clock: the service's clock.
         requests: ``req/localisation``.
         gate: state of the gate.
         odometry: pose in odom.
-        pose: ``state/pose``.
-        health: ``health/slam``.
-        events: receives refusals, and pose lost and found.
+        pose: publisher of ``state/pose``.
+        health: publisher of ``health/slam``.
+        events: sink of refusals, and of reports that the pose is lost or found.
         max_age: see ``GateConfig.max_request_age`` (s).
-        maps: publishes maps of clients; None if the robot has its own.
+        maps: publishes the clients' maps; None if the robot has its own map.
     """
 
     name = ServiceName.SLAM.value
@@ -81,7 +81,7 @@ class OutsideLocalisation:
         self._due = 0
 
     def frames(self) -> tuple[Transform, ...]:
-        """Return odom in map as published."""
+        """Return the published pose of odom in map."""
         stamp = 1 if self._latest is None else self._latest.stamp
         return (planar("map", "odom", stamp, self._correction.value),)
 
@@ -100,16 +100,16 @@ class OutsideLocalisation:
                 self._take(request)
             except RequestRefusedError as error:
                 self._refused += 1
-                now, quiet = self._clock.now(), SECOND  # minimum time between two events with one reason, ns
+                now, quiet = self._clock.now(), SECOND  # minimum time between two events with the same reason, ns
                 if now - self._said.get(error.refusal, -quiet) >= quiet:
                     self._said[error.refusal] = now
                     self._events(error.refusal, Severity.WARNING, request.source, f"localisation refused: {error}")
 
     def _take(self, request: LocalisationRequest) -> None:
-        """Follow a correction.
+        """Apply a correction.
 
         Raises:
-            RequestRefusedError: the sender may not localise, a different one does, or it is not a pose.
+            RequestRefusedError: the sender lacks permission, another client localises, or the request is not a pose.
         """
         now, correction = self._clock.now(), request.correction
         examine(request, self._gate.latest, self._sequences, now, self._max_age)

@@ -1,4 +1,4 @@
-"""Off-board map: publishes the occupancy grid that clients send."""
+"""Off-board map: publishes occupancy grids sent by clients."""
 
 import zlib
 from collections.abc import Awaitable, Callable
@@ -27,7 +27,7 @@ def unpacked(request: MapRequest) -> Cells:
     """Return the cells of a map, shape (height * width,).
 
     Raises:
-        RequestRefusedError: they are not compressed by zlib, too few or too many, or not in -1..100.
+        RequestRefusedError: the cells are not zlib data, too few or too many, or outside -1..100.
     """
     count, reader = request.width * request.height, zlib.decompressobj()
     try:
@@ -43,18 +43,17 @@ def unpacked(request: MapRequest) -> Cells:
 
 
 class OutsideMap:
-    """Publish the newest map of an operator.
+    """Publish the latest map of an operator.
 
-    A request needs nonce, sequence and role as a drive request does. It moves nothing, so it may have been on its way
-    for any time.
+    A request needs nonce, sequence and role like a drive request. It causes no motion, so its age is not limited.
 
     Args:
-        clock: time.
+        clock: the service's clock.
         requests: ``req/map``.
         gate: state of the gate.
-        out: ``state/map``.
-        events: receives refusals.
-        offload: unpacks cells.
+        out: publisher of ``state/map``.
+        events: sink of refusals.
+        offload: unpacks cells outside the event loop.
     """
 
     def __init__(

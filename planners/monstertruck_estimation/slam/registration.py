@@ -1,8 +1,8 @@
 """Iterated fine registration of a scan to a cloud of surface elements (generalised ICP in the plane).
 
-Residual of a pair: the vector d from the moved scan point to its nearest map point, weighted by the inverse of the sum
-of both elements' covariances, under a Geman-McClure kernel; Gauss-Newton over (x, y, yaw) with an optional prior of
-heavy (Cauchy) tails.
+The residual of a pair is the vector d from the moved scan point to its nearest map point, weighted by the inverse of
+the sum of both elements' covariances, under a Geman-McClure kernel. Gauss-Newton over (x, y, yaw), with an optional
+prior of heavy (Cauchy) tails.
 """
 
 import math
@@ -19,12 +19,14 @@ from monstertruck_kinematics.elementary import Array
 Index = NDArray[np.int32]
 
 CELL: Final = 0.3
-"""Edge of the cells that find neighbours, m; also the greatest distance of a pair."""
+"""Edge of the cells for neighbour search (m); also the maximum distance of a pair."""
 EDGE: Final = 0.03
-"""A scan point that lies further along the surface from its map point than this and half the length that the map point
-stands for is beyond the edge of the known surface, m: its continuation is unknown, so the pair is ignored."""
+"""Maximum offset along the surface between a scan point and its map point (m), besides half the map point's length.
+
+Beyond it, the scan point lies outside the known surface, and the pair is ignored.
+"""
 CORRELATION: Final = 0.2
-"""Factor on the information: errors of neighbouring beams are correlated."""
+"""Factor on the information, because errors of neighbouring beams are correlated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,21 +34,21 @@ class Cloud:
     """Surface elements in one frame, hashed by cells of ``CELL`` metres."""
 
     points: Array
-    """Shape (n, 2), m."""
+    """Points, shape (n, 2) (m)."""
     normals: Array
-    """Shape (n, 2), towards the sensor that saw them."""
+    """Unit normals towards the sensor that saw the points, shape (n, 2)."""
     variances: Array
-    """Shape (n, 2): across and along the surface, m^2."""
+    """Variances across and along the surface, shape (n, 2) (m^2)."""
     extents: Array
-    """Shape (n,): half lengths, m."""
+    """Half lengths, shape (n,) (m)."""
     starts: Index
-    """Shape (2^k + 1,): first entry of ``order`` per bucket."""
+    """First entry of ``order`` per bucket, shape (2^k + 1,)."""
     order: Index
-    """Shape (n,): elements by bucket."""
+    """Elements by bucket, shape (n,)."""
 
     @classmethod
     def of(cls, scan: Scan) -> "Cloud":
-        """The elements of ``scan`` with their hash."""
+        """Return the elements of ``scan`` with their hash."""
         return cls(scan.points, scan.normals, scan.variances, scan.extents, *_hashed(scan.points))
 
     def __len__(self) -> int:
@@ -58,17 +60,17 @@ class Fit:
     """Result of a registration."""
 
     pose: Array
-    """Shape (3,): the scan's frame in the cloud's, m and rad."""
+    """Pose of the scan's frame in the cloud's, shape (3,) (m, rad)."""
     information: Array
     """Information matrix of ``pose`` from the pairs alone (x, y in the cloud's frame, yaw), shape (3, 3)."""
     overlap: float
-    """Share of the scan's points that found a fitting partner."""
+    """Share of the scan's points with a fitting partner."""
     residual: float
-    """Root mean square distance across the surface of those, m."""
+    """Root mean square distance of these pairs across the surface (m)."""
     pairs: int
-    """Their number."""
+    """Number of these pairs."""
     cost: float
-    """Twice the negative logarithm of the posterior of pairs and prior."""
+    """Twice the negative log posterior of pairs and prior."""
 
 
 NO_PRIOR: Final = np.zeros((3, 3))
@@ -87,12 +89,12 @@ def register(
 
     Args:
         scan: points with normals in the moving frame.
-        cloud: the map, fixed.
-        guess: shape (3,), mean of the prior and, without ``start``, first pose.
-        prior: information, shape (3, 3), of the guess in the cloud's frame.
-        iterations: Gauss-Newton steps at most.
-        reach: greatest distance of a pair, m (at most ``CELL``).
-        start: shape (3,), first pose, where a coarse search found a better one.
+        cloud: fixed map.
+        guess: mean of the prior and, without ``start``, initial pose, shape (3,).
+        prior: information of the guess in the cloud's frame, shape (3, 3).
+        iterations: maximum number of Gauss-Newton steps.
+        reach: maximum distance of a pair (m), up to ``CELL``.
+        start: initial pose, shape (3,), if a coarse search found a better one.
     """
     pose, information, stats = _register(
         *_elements(scan, cloud),
@@ -108,12 +110,12 @@ def register(
 
 
 def measure(scan: Scan, cloud: Cloud, pose: Array) -> Fit:
-    """Overlap, residual and information of ``scan`` at ``pose``, without moving it."""
+    """Return overlap, residual and information of ``scan`` at ``pose``, without moving it."""
     return register(scan, cloud, pose, iterations=0)
 
 
 def fitting(scan: Scan, cloud: Cloud, pose: Array) -> NDArray[np.bool_]:
-    """Which of the points (n,) of ``scan`` find a fitting partner at ``pose``; see ``Fit.overlap``."""
+    """Mark the points (n,) of ``scan`` with a fitting partner at ``pose``; see ``Fit.overlap``."""
     pose = np.ascontiguousarray(pose, dtype=np.float64)
     found = np.zeros(len(scan), np.bool_)
     _fitting(pose, *_elements(scan, cloud), CELL, found)
@@ -121,13 +123,13 @@ def fitting(scan: Scan, cloud: Cloud, pose: Array) -> NDArray[np.bool_]:
 
 
 def normal_equations(scan: Scan, cloud: Cloud, pose: Array, reach: float = CELL) -> tuple[Array, Array, int]:
-    """Information (3, 3) and gradient (3,) of a registration at ``pose``, and the number of fitting pairs."""
+    """Return information (3, 3), gradient (3,) and number of fitting pairs of a registration at ``pose``."""
     h, g, stats = accumulate(np.ascontiguousarray(pose), *_elements(scan, cloud), min(reach, CELL), EDGE)
     return h, g, int(stats[0])
 
 
 def _elements(scan: Scan, cloud: Cloud) -> tuple[Array, Array, Array, Array, Array, Array, Array, Index, Index]:
-    """Arrays of both clouds for the kernels."""
+    """Return the arrays of both clouds for the kernels."""
     moved = scan.points, scan.normals, scan.variances
     return *moved, cloud.points, cloud.normals, cloud.variances, cloud.extents, cloud.starts, cloud.order
 
@@ -139,7 +141,7 @@ def _bucket(cx: int | np.int64, cy: int | np.int64, mask: int) -> int | np.int64
 
 @njit(cache=True)
 def _hashed(points: Array) -> tuple[Index, Index]:
-    """Buckets by counting sort: starts and order."""
+    """Sort into buckets by counting: return starts and order."""
     n = points.shape[0]
     size = 16
     while size < 2 * n:
@@ -166,12 +168,12 @@ def _hashed(points: Array) -> tuple[Index, Index]:
 def _nearest(
     x: float, y: float, nx: float, ny: float, points: Array, normals: Array, starts: Index, order: Index, reach: float
 ) -> int:
-    """Nearest element that faces the same half-plane; -1 if there is none within ``reach``."""
+    """Return the nearest element that faces the same half-plane; -1 if there is none within ``reach``."""
     mask = starts.size - 2
     cx = np.int64(math.floor(x / CELL))
     cy = np.int64(math.floor(y / CELL))
     best, found = reach * reach, -1
-    for ax in (0, -1, 1):  # the cell of the point first: most nearest points lie in it
+    for ax in (0, -1, 1):  # the point's own cell first, which holds most nearest points
         wx = 0.0 if ax == 0 else abs(x - (cx + max(ax, 0)) * CELL)
         for ay in (0, -1, 1):
             wy = 0.0 if ay == 0 else abs(y - (cy + max(ay, 0)) * CELL)
@@ -192,7 +194,7 @@ def accumulate(
     pose: Array, points: Array, normals: Array, variances: Array, map_points: Array, map_normals: Array,
     map_variances: Array, map_extents: Array, starts: Index, order: Index, reach: float, edge: float,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Normal equations at ``pose``: information H (3, 3), gradient g (3,), (pairs, sum of squares across, cost)."""
+    """Return H (3, 3), gradient g (3,) and (pairs, sum of squares across, cost) of the normal equations."""
     h = np.zeros((3, 3))
     g = np.zeros(3)
     stats = np.zeros(3)
@@ -204,7 +206,7 @@ def accumulate(
         ny = s * normals[i, 0] + c * normals[i, 1]
         x, y = rx + pose[0], ry + pose[1]
         j = _nearest(x, y, nx, ny, map_points, map_normals, starts, order, reach)
-        kernel = 3.0  # Mahalanobis distance of a pair with a quarter of the full influence
+        kernel = 3.0  # Mahalanobis distance at which a pair has a quarter of its full influence
         if j < 0:
             stats[2] += kernel * kernel
             continue
@@ -258,7 +260,7 @@ def _fitting(
 
 @njit(cache=True)
 def solve3(h: Array, g: Array) -> Array:
-    """Solution of the symmetric positive system h x = g by Cholesky; zeros if it is singular."""
+    """Solve the symmetric positive system h x = g by Cholesky; zeros if it is singular."""
     x = np.zeros(3)
     a = h[0, 0]
     if a <= 1e-12:
@@ -292,7 +294,7 @@ def _register(
     pose = start.copy()
     edge = reach if iterations > 0 else EDGE
     done = False
-    # Squared Mahalanobis distance of a prior with half its weight: wheels slip further than their covariance.
+    # Squared Mahalanobis distance at which a prior has half its weight: wheels slip further than their covariance.
     tails = 4.0
     for remaining in range(iterations, -1, -1):
         h, g, stats = accumulate(
@@ -312,7 +314,7 @@ def _register(
         pose = pose + step
         way, turn = math.hypot(step[0], step[1]), abs(step[2])
         done = edge == EDGE and way < 1e-4 and turn < 2e-5
-        # Pairs beyond the edge do count, for they lead to the place from far off, until a step is shorter, m and rad.
+        # Pairs beyond the edge are used until a step is shorter than this, m and rad: they lead to the place from afar.
         coarse = (1e-3, 5e-4)
         if way < coarse[0] and turn < coarse[1]:
             edge = EDGE

@@ -1,13 +1,13 @@
-"""Relocalisation: detect that scans no longer fit the map, and find the place of the new submap in that map.
+"""Relocalisation: detects that scans no longer fit the map, and finds the place of the new submap in that map.
 
-A robot that was carried fits nowhere near its predicted pose. Its scans start a separate submap, which no odometry
-joins to the map. The surroundings of the latest keyframe are searched for in every other submap, the map first (branch
-and bound, a slice of yaws per scan, so that no scan waits for all of them). A place found is verified like every loop
-closure, and joins both submaps only with the support of matches from other places. So a submap whose place was not
-found while the robot was in it is found when the robot returns to it, from the map or from a later submap.
+A robot that was carried fits nowhere near its predicted pose. Its scans start a separate submap, which odometry does
+not join to the map. The surroundings of the latest keyframe are searched for in every other submap, the map first
+(branch and bound, one slice of yaws per scan, so that no scan waits for the whole search). A place found is verified
+like every loop closure, and joins both submaps only with the support of matches from other places. A submap whose place
+was not found at first is found when the robot returns to it, from the map or from a later submap.
 
-A join may still be wrong: a room that looks like one of the map fits it just as well. So a join is in doubt while the
-robot drives on, and undone if the observations of both sides contradict it then, or if the robot is lost again.
+A join may still be wrong: a similar-looking room fits just as well. A join therefore stays in doubt while the robot
+drives on, and is undone if later observations of both sides contradict it, or if the robot is lost again.
 """
 
 import math
@@ -35,9 +35,9 @@ PERIOD_GAIN: Final = 0.1
 class LossDetector:
     """Detect that scans no longer fit the map.
 
-    After a misfit or a gap the overlap must return to nearly its mean, and after a gap the match must
-    constrain all directions: a partial fit, or one wall, is found in many places. The mapper judges whether the match
-    looks through walls of the map, and whether the motion led there: rooms of one shape overlap wherever they are.
+    After a misfit or a gap the overlap must return to nearly its mean, and after a gap the match must constrain all
+    directions: a partial fit, or one wall, occurs in many places. The mapper decides whether the match looks through
+    walls of the map and whether it agrees with the motion: rooms of one shape overlap everywhere.
     """
 
     def __init__(self) -> None:
@@ -92,22 +92,22 @@ class LossDetector:
         """Register the arrival of a scan with ``stamp`` (ns) that will be matched."""
         if self._stamp is not None:
             dt = (stamp - self._stamp) / SECOND
-            # A gap is a pause longer than this (s) and than this multiple of the usual one: the robot may be elsewhere
-            # after it.
+            # A gap is a pause longer than this (s) and than this multiple of the usual one: the robot may then be
+            # elsewhere.
             gap = (5.0, 3.0)
             self.after_gap |= dt > max(gap[0], gap[1] * self._period)
             self._period += (dt - self._period) * (PERIOD_GAIN if self._period else 1.0)
         self._stamp = stamp
 
     def take(self, match: ScanMatch, moved: tuple[float, float] = (0.0, 0.0), *, led: bool = False) -> None:
-        """Take the match of the scan that arrived.
+        """Add the match of the scan that arrived.
 
         Args:
-            match: the match.
+            match: match of the scan.
             moved: distance, and motion, since the previous scan by wheels that agree with the scans, as multiples of
                 the distance and motion between keyframes; 0 without such wheels.
-            led: the match is where the motion led, by wheels over a gap or between sparse scans, or the rest of its
-                view is new: it fits, however little of its view is known.
+            led: whether the match agrees with the motion (by wheels over a gap or between sparse scans), or the rest of
+                its view is new: it then fits, however little of its view is known.
         """
         self._path += moved[0]
         self._spacing += (moved[1] - self._spacing) * PERIOD_GAIN
@@ -127,14 +127,14 @@ class LossDetector:
         return not match.accepted or match.overlap < least or (self.after_gap and match.degenerate)
 
     def restart(self) -> None:
-        """Treat the latest scan as fitting, because it is part of the map."""
+        """Treat the latest scan as fitting, because it has become part of the map."""
         self._misfits, self.after_gap, self.fitted, self._path = 0, False, self._stamp or 0, 0.0
 
 
 def prediction_is_certain(covariance: Array) -> bool:
     """Whether the ``covariance``, (3, 3), of a predicted pose is small enough to rule out any other place.
 
-    A match in a wider window is one place that fits; there may be others.
+    A match in a wider window is one of possibly several fitting places.
     """
     return all(_certain(covariance))
 
@@ -146,13 +146,13 @@ def _certain(covariance: Array) -> tuple[bool, bool]:
 
 
 def led_there(match: ScanMatch, guess: Array, covariance: Array) -> bool:
-    """Whether ``match`` is where wheels led over a gap: ``guess``, shape (3,), with ``covariance``, shape (3, 3).
+    """Whether ``match`` agrees with wheels over a gap: with ``guess``, shape (3,), and ``covariance``, shape (3, 3).
 
-    The wheels must know the position; a turn over the gap may have made the yaw uncertain, which the scan shows.
+    The wheels must know the position; the scan may correct a yaw that a turn over the gap has made uncertain.
     """
-    # Maximum Mahalanobis distance from the predicted pose of a match where the wheels led. Half of the right matches
-    # are that near (chi-square of three degrees of freedom: 48 %), and one in fifteen of the wrong ones, which are
-    # spread over the matcher's window of three standard deviations on each axis (a ball in a cube).
+    # Maximum Mahalanobis distance from the predicted pose of a match that agrees with the wheels. Half of the correct
+    # matches are that near (chi-square of three degrees of freedom: 48 %), and one in fifteen of the wrong ones, which
+    # are spread over the matcher's window of three standard deviations on each axis (a ball in a cube).
     led = 1.5
     return off_guess(match.pose, guess, covariance) <= led and _certain(covariance)[0]
 
@@ -165,8 +165,8 @@ def exceeds(off: tuple[float, float], limits: tuple[float, float]) -> bool:
 def contradicts(keyframes: KeyframeMap, scan: Scan, pose: Array, most: float = CONTRADICTION) -> bool:
     """Whether ``scan`` at ``pose``, shape (3,), and the keyframes around it contradict each other.
 
-    They do if more than a share ``most`` of the beams of either pass through walls of the other. Areas that no keyframe
-    saw contradict nothing: the robot drove on by odometry alone, where there was little to see.
+    They do if more than a share ``most`` of the beams of either pass through walls of the other. Areas not seen by any
+    keyframe contradict nothing: the robot may have crossed them by odometry alone.
     """
     own = np.flatnonzero(keyframes.part == keyframes.part[-1])
     off = keyframes.poses[own, :2] - pose[:2]
@@ -193,14 +193,14 @@ class JoinChange(StrEnum):
 
 
 class Relocation:
-    """Join submaps: the latest keyframe's to the map, and those left open to the robot's current submap.
+    """Join submaps: the latest keyframe's to the map, and other open ones to the robot's current submap.
 
     A join is checked at every keyframe until it is confirmed.
     """
 
     def __init__(self) -> None:
         self._submaps: dict[int, tuple[int, Array, Submap]] = {}
-        """For each part: its keyframes, the pose of the first one, and their surfaces, all as of the merge."""
+        """Per part: its keyframes, the pose of the first one, and their surfaces, all at the time of the merge."""
         self._progress: PiecewiseSearch[Join | JoinChange | None] | None = None
         self._last = -1
 
@@ -212,7 +212,7 @@ class Relocation:
     def step(self, keyframes: KeyframeMap, closer: LoopCloser, budget: ScanBudget) -> JoinChange | None:
         """Continue the search, or the check of a join; return whether submaps were joined or parted.
 
-        Both move poses. A place found moves a submap.
+        Both move poses; a place found moves a submap.
         """
         newest = len(keyframes) - 1
         if self._progress is None:
@@ -226,7 +226,7 @@ class Relocation:
         return self._part(keyframes, closer, found) if isinstance(found, Join) else found
 
     def part(self, keyframes: KeyframeMap, closer: LoopCloser) -> JoinChange | None:
-        """Undo all joins in doubt, if there are any."""
+        """Undo all joins in doubt."""
         return self._part(keyframes, closer, keyframes.doubtful[0]) if keyframes.doubtful else None
 
     def _part(self, keyframes: KeyframeMap, closer: LoopCloser, join: Join) -> JoinChange:
@@ -281,7 +281,7 @@ class Relocation:
         return None
 
     def _place(self, keyframes: KeyframeMap, at: int, part: int) -> Pieces[Array | None]:
-        """Return the place of keyframe ``at``'s surroundings in submap ``part``; None without one, or with several."""
+        """Return the place of keyframe ``at``'s surroundings in submap ``part``; None if there is none or several."""
         origin, submap = yield from self._submap(keyframes, part)
         levels = 7  # levels of the pyramid of the whole map
         yield submap.grid_cost(levels)
@@ -294,7 +294,7 @@ class Relocation:
         slices = max(math.ceil(look_ups(points, (half, math.pi), levels) / PIECE), fewest_slices)
         peaks: list[Peak] = []
         work = 15_000  # maximum number of blocks evaluated below the first level in one slice
-        anywhere = (1e6, 1e6)  # standard deviation of the predicted pose, m and rad: it is unknown
+        anywhere = (1e6, 1e6)  # standard deviation of the unknown pose, m and rad
         min_score = 0.5  # minimum mean likelihood of a place found
         for k in range(slices):
             yield PIECE + work * len(points)
@@ -306,7 +306,7 @@ class Relocation:
         if best is None:
             return None
         # Search again around the best place for a similar one in the same direction.
-        window = half, 0.1  # half width of the search for a rival that looks the same way, rad
+        window = half, 0.1  # half width of the search for a rival of similar direction, rad
         yield look_ups(points, window, levels)
         peak = correlate(grid, points, best, window, anywhere, min_score, APART[0], work)
         if peak is None or peak.rival > MAX_RIVAL * peak.score:
@@ -314,7 +314,7 @@ class Relocation:
         return compose(keyframes.poses[part], between(origin, peak.pose))
 
     def _submap(self, keyframes: KeyframeMap, part: int) -> Pieces[tuple[Array, Submap]]:
-        """Return the keyframes of ``part``, merged again when it has grown, and the pose of the first one then."""
+        """Return the keyframes of ``part``, merged again after growth, and the pose of its first one at that time."""
         numbers = np.flatnonzero(keyframes.part == part)
         known = self._submaps.get(part)
         if known is None or known[0] != len(numbers):
@@ -351,10 +351,10 @@ def _samples(keyframes: KeyframeMap) -> list[int]:
 
 
 def _checks(keyframes: KeyframeMap, at: int, part: int) -> tuple[list[int], int]:
-    """Keyframes to verify where submap ``part`` has been aligned with that of keyframe ``at``; the other submap.
+    """Return the keyframes to verify after submap ``part`` was aligned with keyframe ``at``'s, and the other submap.
 
-    They are of the smaller of both, for what it saw the greater one should have; those at the place of ``at`` first,
-    and only where some of the other submap are near.
+    They come from the smaller submap, whose views the greater one should share: first those at the place of ``at``, and
+    only those near keyframes of the other submap.
     """
     submaps = [np.flatnonzero(keyframes.part == one) for one in (keyframes.part[at], part)]
     few, many = sorted(submaps, key=len)
@@ -370,7 +370,7 @@ def _checks(keyframes: KeyframeMap, at: int, part: int) -> tuple[list[int], int]
 
 
 def _unique(peaks: list[Peak]) -> Array | None:
-    """Return the best pose, if no other place is nearly as good."""
+    """Return the best pose if no other place scores nearly as well."""
     if not peaks:
         return None
     best = max(peaks, key=lambda peak: peak.score)

@@ -14,10 +14,13 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_schemas.base import position_deviation
 
 LIKELY: Final = 3.0
-"""Standard deviations within which a predicted pose is likely: half width of a search around it, and the gate of
-matches that overlap less than ``LOW_OVERLAP`` (Mahalanobis)."""
+"""Likely range of a predicted pose, in standard deviations.
+
+It is the half width of a search around the pose, and the gate (Mahalanobis) of matches that overlap less than
+``LOW_OVERLAP``.
+"""
 LOW_OVERLAP: Final = 0.6
-"""Matches that overlap less are compared with a result of the wide search."""
+"""Overlap below which a match is compared with a result of the wide search."""
 
 
 class MatchStatus(StrEnum):
@@ -30,7 +33,7 @@ class MatchStatus(StrEnum):
     CONTRADICTED = "contradicted"
     """Beams of the scan pass through walls of the map, or beams of the map through objects in the scan."""
     UNSURE = "unsure"
-    """After a gap in the scans: the robot may be anywhere, and one place that fits is not a proof."""
+    """After a gap in the scans the robot may be anywhere, so one fitting place is not a proof."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,14 +49,14 @@ class ScanMatch:
     residual: float
     """Root mean square distance across the surfaces (m)."""
     degeneracy: float
-    """Smaller eigenvalue of the information on the position over the greater one, 0..1: near 0 in a corridor."""
+    """Ratio of the smaller to the greater eigenvalue of the position's information, 0..1; near 0 in a corridor."""
     direction: float
     """Yaw of the weakest direction in the submap's frame (rad), in [-pi/2, pi/2]."""
     verdict: MatchStatus
     information: Array | None = None
     """Inverse covariance by the scan alone, without the guess, shape (3, 3); None if the match is rejected."""
     moving: float = 0.0
-    """Share of the scan's points that were left out because they move, 0..1."""
+    """Share of the scan's points left out as moving, 0..1."""
 
     @property
     def accepted(self) -> bool:
@@ -62,10 +65,10 @@ class ScanMatch:
 
     @property
     def degenerate(self) -> bool:
-        """Whether the scan does not constrain the position along ``direction``, or only people may do so.
+        """Whether the scan leaves the position undetermined along ``direction``, or may be determined only by people.
 
-        People are round and constrain all directions alike: where as many points as were left out move unnoticed, they
-        explain a ratio of the eigenvalues up to their share.
+        People are round and constrain all directions equally. As many points as were left out may move undetected; they
+        can explain an eigenvalue ratio up to their share.
         """
         # A match is degenerate (a corridor) below this ratio of the eigenvalues of the information on the position.
         degenerate_ratio = 0.03
@@ -81,24 +84,24 @@ class ScanMatcher(Protocol):
         Args:
             scan: points in base.
             delta: predicted motion of the base since the last scan, shape (3,).
-            guess: pose predicted by it in the submap's frame, shape (3,).
+            guess: resulting pose in the submap's frame, shape (3,).
             covariance: covariance of ``guess``, shape (3, 3).
             submap: the map around the predicted pose.
         """
 
 
 class PlanarMatcher:
-    """Correlation in a window given by the guess's covariance, then generalised ICP with the guess as prior.
+    """Correlation in a window set by the guess's covariance, then generalised ICP with the guess as prior.
 
-    Every piece of surface is weighted by its length, not by the beams that met it.
-    A match that is rejected or overlaps little is repeated in a window three times as wide, because wheels
-    slip further than their covariance; its result must overlap more.
+    Every piece of surface is weighted by its length, not by its number of beams. A match that is rejected or overlaps
+    little is repeated in a window three times as wide, because wheels slip further than their covariance; the new
+    result must overlap more.
     """
 
     def match(self, scan: Scan, delta: Array, guess: Array, covariance: Array, submap: Submap) -> ScanMatch:
         """See ``ScanMatcher``."""
-        # The mean of a scan's points in a square of this edge, m, is matched: by beams, a person or robot beside the
-        # lidar would outweigh all walls.
+        # Edge of the squares whose mean points are matched, m: weighted by beams, a person or robot beside the lidar
+        # would outweigh all walls.
         spacing = 0.04
         scan = scan.averaged(spacing)
         if not (enough(len(scan)) and enough(len(submap.cloud))):
@@ -110,17 +113,17 @@ class PlanarMatcher:
         least = match.overlap + wide_overlap_gain if match.accepted else 0.0
         wide_factor = 3.0  # factor on the standard deviation of the predicted pose in the wide search
         again = self._match_in_window(scan, guess, covariance * wide_factor**2, submap)
-        if again.accepted and again.overlap >= max(0.5, least):  # minimum overlap of a result of the wide search,
+        if again.accepted and again.overlap >= max(0.5, least):  # minimum overlap of a result of the wide search
             return again
         return match
 
     def _match_in_window(self, scan: Scan, guess: Array, covariance: Array, submap: Submap) -> ScanMatch:
         deviation = deviations(covariance)
-        margin = 0.15  # added to it, m: stamps of odometry and scans disagree
+        margin = 0.15  # allowance for disagreeing stamps of odometry and scans, m
         max_window = (2.0, 1.6)  # maximum half width of the search, m and rad
         window = min(LIKELY * deviation[0] + margin, max_window[0]), min(LIKELY * deviation[1], max_window[1])
         prior: Array = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
-        coarse_points = 160  # points of a scan used in the correlative search
+        coarse_points = 160  # number of points in the correlative search
         points = scan.points[np.linspace(0, len(scan) - 1, min(len(scan), coarse_points)).astype(np.intp)]
         min_score = 0.2  # minimum mean likelihood of a result of the correlative search
         levels = 4  # levels of its likelihood pyramid
@@ -151,7 +154,7 @@ def gated(fit: Fit, guess: Array, covariance: Array) -> ScanMatch:
 
 
 def enough(pairs: int) -> bool:
-    """Whether so many corresponding pairs may determine a pose."""
+    """Whether this number of pairs can determine a pose."""
     return pairs >= 12
 
 

@@ -1,8 +1,8 @@
 """Conversion of ranges to surface elements: deskewing, levelling, and points with normals.
 
-Every point carries the covariance of the surface element it was measured on, by its unit normal (towards the sensor)
-and the variances along and across it: a point among neighbours on a line is not constrained along that line, a lone
-point equally in all directions (generalised ICP: Segal, Haehnel, Thrun 2009).
+Every point carries the covariance of its surface element, from the unit normal (towards the sensor) and the variances
+along and across the surface: a point among neighbours on a line is unconstrained along that line, a lone point is
+constrained equally in all directions (generalised ICP: Segal, Haehnel, Thrun 2009).
 """
 
 import math
@@ -18,11 +18,11 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Twist2
 
 RANGE_NOISE: Final = 0.012
-"""Least standard deviation of a range close by, m (URG-04LX and SICK LMS200 manuals: 10 to 15 mm)."""
+"""Minimum standard deviation of a short range (m) (URG-04LX and SICK LMS200 manuals: 10 to 15 mm)."""
 RELATIVE_NOISE: Final = 0.005
-"""Increase per metre of range (beam width, URG-04LX: 1 % of the range as limits)."""
+"""Increase per metre of range (beam width; URG-04LX: limits of 1 % of the range)."""
 SLIDE: Final = 5.0
-"""Standard deviation along a line, m: unconstrained."""
+"""Standard deviation along a line (m): unconstrained."""
 
 
 STEEPEST: Final = math.sin(math.radians(60))
@@ -30,51 +30,51 @@ STEEPEST: Final = math.sin(math.radians(60))
 
 @dataclass(frozen=True, slots=True)
 class ScanGeometry:
-    """How ranges become points of the base frame."""
+    """Geometry that converts ranges to points in base."""
 
     start_angle: float
-    """Angle of the first beam, rad, counter-clockwise from the sensor's x axis."""
+    """Angle of the first beam (rad), counter-clockwise from the sensor's x axis."""
     angle_increment: float
-    """Angle between neighbouring beams, rad."""
+    """Angle between neighbouring beams (rad)."""
     range_min: float
-    """Minimum range, m; shorter ones mean no return."""
+    """Minimum range (m); shorter ranges mean no return."""
     range_max: float
-    """Maximum range, m; ranges at or beyond it mean no return."""
+    """Maximum range (m); ranges from it on mean no return."""
     time_increment: float = 0.0
-    """Seconds between neighbouring beams."""
+    """Time between neighbouring beams (s)."""
     mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Pose of the sensor in base, m and rad."""
+    """Pose of the sensor in base (m, rad)."""
     noise: float = 0.0
-    """Standard deviation of a range close by, m; counts from ``RANGE_NOISE`` on."""
+    """Standard deviation of a short range (m), used if above ``RANGE_NOISE``."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """Points of one scan in the base frame at the time of its first beam."""
+    """Points of one scan in base at the time of its first beam."""
 
     points: Array
-    """Shape (n, 2), m."""
+    """Points, shape (n, 2) (m)."""
     normals: Array
-    """Shape (n, 2), unit vectors towards the sensor."""
+    """Unit normals towards the sensor, shape (n, 2)."""
     variances: Array
-    """Shape (n, 2): across and along the surface, m^2."""
+    """Variances across and along the surface, shape (n, 2) (m^2)."""
     extents: Array
-    """Shape (n,): half of the length of surface each point stands for, m; 0 for lone points."""
+    """Half of the surface length that each point stands for, shape (n,) (m); 0 for lone points."""
 
     def __len__(self) -> int:
         return len(self.points)
 
     def downsampled(self, cell: float, most: int) -> "Scan":
-        """About one point per square of ``cell``, and at most ``most``, spread evenly."""
+        """Return about one point per square of ``cell``, and at most ``most``, spread evenly."""
         kept = downsample_indices(self.points, cell)
         if len(kept) > most:
             kept = kept[np.linspace(0, len(kept) - 1, most).astype(np.intp)]
         return self.chosen(kept)
 
     def averaged(self, cell: float) -> "Scan":
-        """The mean of the points in every square of ``cell`` that face the same quarter; it is as unsure as one point.
+        """Return the mean, as uncertain as one point, of the points in every square of ``cell`` facing one quadrant.
 
-        Every piece of surface counts by its length then, however many beams met it.
+        Every piece of surface then has equal weight, whatever its number of beams.
         """
         quarters = np.floor(np.arctan2(self.normals[:, 1], self.normals[:, 0]) / (math.pi / 2)).astype(np.int64)
         keys = _cells(self.points, cell) * 4 + quarters % 4
@@ -90,7 +90,7 @@ class Scan:
         return Scan(mean(self.points), normals, mean(self.variances), mean(self.extents[:, None])[:, 0])
 
     def chosen(self, kept: NDArray[np.intp] | NDArray[np.bool_]) -> "Scan":
-        """The marked or numbered points."""
+        """Return the marked or numbered points."""
         return Scan(self.points[kept], self.normals[kept], self.variances[kept], self.extents[kept])
 
 
@@ -103,10 +103,10 @@ def prepare(
     """Return points with normals; beams without a return, NaN and ranges out of bounds are left out.
 
     Args:
-        ranges: shape (n,), m; anything not finite is a no-return.
+        ranges: shape (n,) (m); non-finite values mean no return.
         geometry: angles, limits, times and mount.
-        twist: the base's velocity (vx, vy, wz; m/s, rad/s), to undo the scan's motion distortion.
-        longest: ranges beyond this are left out too, m.
+        twist: velocity of base (vx, vy, wz; m/s, rad/s), for deskewing.
+        longest: maximum range that is used (m).
     """
     values = np.ascontiguousarray(ranges, dtype=np.float64)
     limit = min(geometry.range_max, np.nextafter(longest, math.inf))
@@ -126,11 +126,11 @@ def prepare(
 
 
 def prepare_input(inputs: ScanInput, longest: float, twist: Twist2 = (0.0, 0.0, 0.0)) -> Scan:
-    """Points of a scan in base: motion undone, level_ranges, without what hit the ground or the ceiling.
+    """Return the points of a scan in base: deskewed, levelled, without hits of the ground or the ceiling.
 
     Args:
-        inputs: the scan.
-        longest: longer ranges are not used, m.
+        inputs: scan with mount and tilt.
+        longest: maximum range that is used (m).
         twist: twist of the base, m/s and rad/s, used without odometry.
     """
     geometry = ScanGeometry(
@@ -146,9 +146,9 @@ def prepare_input(inputs: ScanInput, longest: float, twist: Twist2 = (0.0, 0.0, 
 
 
 def level_ranges(inputs: ScanInput) -> Array:
-    """Ranges in the horizontal; NaN where a beam met the ground or the ceiling.
+    """Return the horizontal ranges; NaN for beams that hit the ground or the ceiling.
 
-    A beam at angle a rises by cos(a) sx + sin(a) sy a metre, with the ``slopes`` (sx, sy) of the sensor's axes.
+    A beam at angle a rises by cos(a) sx + sin(a) sy per metre, with the ``slopes`` (sx, sy) of the sensor's axes.
     """
     ranges = np.asarray(inputs.ranges, dtype=np.float64)
     if inputs.slopes is None:
@@ -161,7 +161,7 @@ def level_ranges(inputs: ScanInput) -> Array:
     if inputs.height is not None:
         with np.errstate(invalid="ignore"):
             ends = inputs.height + ranges * rise
-            ground = 0.05  # beams that end this near to ground or ceiling hit those, m
+            ground = 0.05  # maximum distance of a hit from ground or ceiling, m
             hit = ends < ground
             if inputs.ceiling is not None:
                 hit |= ends > inputs.ceiling - ground
@@ -171,7 +171,7 @@ def level_ranges(inputs: ScanInput) -> Array:
 
 @njit(cache=True)
 def _prepare(ranges, start, increment, shortest, longest, beam_time, mount, twist, near):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
-    """Arrays of ``Scan``; see there."""
+    """Compute the arrays of ``Scan``."""
     n = 0
     for r in ranges:
         if r >= shortest and r < longest:
@@ -190,7 +190,7 @@ def _prepare(ranges, start, increment, shortest, longest, beam_time, mount, twis
         y = mount[1] + r * math.sin(angle)
         dt = i * beam_time
         turn = twist[2] * dt
-        # Along the arc: half of the turn before the way, half after it.
+        # Along the arc: half of the turn before the translation, half after it.
         wx = (twist[0] * math.cos(turn / 2) - twist[1] * math.sin(turn / 2)) * dt
         wy = (twist[0] * math.sin(turn / 2) + twist[1] * math.cos(turn / 2)) * dt
         c, s = math.cos(turn), math.sin(turn)
@@ -204,7 +204,7 @@ def _prepare(ranges, start, increment, shortest, longest, beam_time, mount, twis
     normals = np.empty((n, 2))
     variances = np.empty((n, 2))
     extents = np.zeros(n)
-    joined = np.zeros(n + 1, np.bool_)  # with the point before
+    joined = np.zeros(n + 1, np.bool_)  # with the previous point
     for i in range(1, n):
         joined[i] = _joined(points, beams, reach, abs(increment), near, i - 1, i)
     for i in range(n):
@@ -220,14 +220,14 @@ def _joined(points, beams, reach, increment, near, a, b):  # type: ignore[no-unt
         return False
     r = min(reach[a], reach[b])
     apart = math.hypot(points[a, 0] - points[b, 0], points[a, 1] - points[b, 1])
-    # Neighbouring beams hit one surface if the line through their ends is steeper to the beam than this, rad.
+    # Minimum angle between the line through the ends of neighbouring beams and the beam for a common surface, rad.
     grazing = 0.12
     return apart < r * increment * gap / grazing + 3.0 * (near + RELATIVE_NOISE * r)
 
 
 @njit(cache=True)
 def _surface(points, origins, joined, reach, increment, near, i, normals, variances, extents):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
-    """Normal and variances of point ``i`` from its neighbours in beam order."""
+    """Compute normal and variances of point ``i`` from its neighbours in beam order."""
     noise = near + RELATIVE_NOISE * reach[i]
     spacing = reach[i] * increment
     window = max(0.2, 2.5 * spacing)
@@ -258,8 +258,8 @@ def _surface(points, origins, joined, reach, increment, near, i, normals, varian
     length = math.hypot(bx, by)
     if length < 1e-9:
         bx, by, length = 1.0, 0.0, 1.0
-    slanted = 3.0  # two lone neighbours this many times as far apart as beams are lie on a wall seen at a slant
-    # Two points far apart are the thin end of a wall along the beam; two close together may be a leg of a chair.
+    slanted = 3.0  # two lone neighbours this many beam spacings apart lie on a wall seen at a slant
+    # Two points far apart are the thin end of a wall along the beam; two close together may be a chair leg.
     if count >= 3 or (count == 2 and furthest > slanted * spacing):
         mx, my = sx / count, sy / count
         cxx, cxy, cyy = sxx / count - mx * mx, sxy / count - mx * my, syy / count - my * my
@@ -288,12 +288,12 @@ def _cells(points, cell):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
 
 
 def downsample_indices(points: Array, cell: float) -> NDArray[np.intp]:
-    """Indices, rising, of one point in every square of ``cell`` m.
+    """Return rising indices of one point in every square of ``cell`` m.
 
-    Which one must not depend on its noise: the first in beam order would be the one that noise moved across the edge,
-    and every wall would be rotated a little.
+    The choice must not depend on the noise: the first point in beam order would be the one that noise moved across the
+    edge, which would rotate every wall a little.
     """
-    # Multiples of it, less their whole part, are an even mixture of early and late beams.
+    # The fractional parts of its multiples mix early and late beams evenly.
     golden = (math.sqrt(5.0) - 1.0) / 2.0
     order = np.argsort(np.arange(len(points)) * golden % 1.0, kind="stable")
     _, first = np.unique(_cells(points[order], cell), return_index=True)
@@ -301,7 +301,7 @@ def downsample_indices(points: Array, cell: float) -> NDArray[np.intp]:
 
 
 def scans_in_a_room() -> list[ScanInput]:
-    """Return four scans of a drive in a square room, so that workers compile and load all before their first scan."""
+    """Return four scans of a drive in a square room, for workers that compile everything before the first scan."""
     angles = np.linspace(-2.0, 2.0, 200)
     along, across = np.cos(angles), np.sin(angles)
     scans = []

@@ -40,7 +40,7 @@ from monstertruck_schemas.state import Grid, Odometry, ScanMotion, Transform
 
 TARGET: Final = "monstertruck_estimation.slam.worker:SlamWorker"
 UNMATCHED: Final = SECOND
-"""Maximum time without a usable scan (ns); then odometry alone predicts the pose and the lidar is not a source."""
+"""Maximum time without a usable scan (ns); then odometry alone predicts the pose, without the lidar as source."""
 CORRECTIONS: Final = {
     "closed": (Reason.LOOP_CLOSED, Severity.INFO, "closure {}"),
     "joined": (Reason.LOOP_CLOSED, Severity.INFO, "two submaps are joined"),
@@ -52,33 +52,33 @@ CORRECTIONS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class OtherLidar:
-    """Second lidar: its scans complete the map; only those of the first one are matched."""
+    """Second lidar: its scans extend the map; only those of the first lidar are matched."""
 
     mount: Mount
     scan: Subscription[LaserScan]
     angles: ScanAngles | None
-    """As of the first lidar."""
+    """Body and mount angles, as for the first lidar."""
 
 
 class SlamService:
-    """Sends every scan to the worker with odometry at its stamp; between scans the pose follows odometry.
+    """Send every scan to the worker with odometry at its stamp; between scans the pose follows odometry.
 
     Args:
-        config: mapping, and where the map is saved.
+        config: settings of mapping, and folders of the map.
         mount: mount of the lidar.
         body: length and width of the robot (m).
         run: this run, for saved maps.
-        clock: time.
-        scan: lidar, bounded and counted.
+        clock: the service's clock.
+        scan: scans of the lidar from a bounded, counted queue.
         odometry: pose in odom; without it (None) the pose is published once per scan.
-        angles: angles of body and mount at the time of scans, to discard hits of the ground; None without a compass.
+        angles: angles of body and mount at the time of scans, for removing hits of the ground; None without a compass.
         other: the second lidar; None without one.
-        pose: ``state/pose``.
-        whole: ``state/map``.
-        tiles: ``state/map_tiles``.
-        motion: ``state/scan_motion``.
-        health: ``health/slam``.
-        events: receives closures, losses and unusable scans.
+        pose: publisher of ``state/pose``.
+        whole: publisher of ``state/map``.
+        tiles: publisher of ``state/map_tiles``.
+        motion: publisher of ``state/scan_motion``.
+        health: publisher of ``health/slam``.
+        events: sink of closures, losses and unusable scans.
     """
 
     name = ServiceName.SLAM.value
@@ -108,7 +108,7 @@ class SlamService:
         self._other_sent: LaserScan | None = None
         self._motions = motion
         self._pose, self._whole, self._tiles, self._health, self._events = pose, whole, tiles, health, events
-        self._history: deque[tuple[int, Pose2]] = deque(maxlen=128)  # poses of odometry kept: 2.5 s at 50 Hz
+        self._history: deque[tuple[int, Pose2]] = deque(maxlen=128)  # number of stored odometry poses: 2.5 s at 50 Hz
         self._correction = SmoothedCorrection(config.slew, config.jump)
         self._newest: SlamEstimate | None = None
         self._latest: Odometry | None = None
@@ -134,7 +134,7 @@ class SlamService:
         self._bases: dict[int, Pose2] = {}
 
     def frames(self) -> Iterable[Transform]:
-        """Return odom in map as published; without odometry, base in map."""
+        """Return the published pose of odom in map; without odometry, of base in map."""
         if self._odometry is not None:
             stamp = self._history[-1][0] if self._history else 1
             return (planar("map", "odom", stamp, self._correction.value),)
@@ -144,15 +144,15 @@ class SlamService:
         return planar("map", "odom", stamp, self._newest.pose), planar("odom", "base", stamp, (0.0, 0.0, 0.0))
 
     def bases_at(self, instants: tuple[int, ...]) -> Mapping[int, Pose2]:
-        """Return the poses of base at some instants (ns) by the current graph; updated every ``tiles_period``.
+        """Return the poses of base at several stamps (ns) in the current graph; updated every ``tiles_period``.
 
-        Instants requested now are answered later; instants unknown to the map are never answered.
+        Stamps requested now are answered later; stamps unknown to the map are never answered.
         """
         self._instants = instants
         return self._bases
 
     def save_soon(self) -> bool:
-        """Save the map with the next scan; return whether there is a map and a folder for it."""
+        """Save the map at the next scan; return whether there is a map and a folder for it."""
         self._due["save"] = 0
         self._asked.set()
         return self._config.save is not None and self._config.mode == "mapping"
@@ -161,11 +161,12 @@ class SlamService:
         """Send scans to the worker until cancelled, then save the map.
 
         Raises:
-            WorkerError: the worker failed, hung or died; the next session begins a new map where the robot is now.
+            WorkerError: the worker failed, hung or died; the next session starts a new map at the robot's current
+                place.
             DamagedFileError: the saved map cannot be read.
         """
         config = self._config
-        start_timeout = 180.0  # real seconds the worker may take to start: numba compiles at the first start
+        start_timeout = 180.0  # maximum start time of the worker, s of real time: numba compiles at the first start
         worker = WorkerActor(
             self.name,
             TARGET,
@@ -255,7 +256,7 @@ class SlamService:
         while True:
             await self._asked.wait()
             self._asked.clear()
-            # Seconds to wait for a usable scan before a requested map is saved; then it is saved without one.
+            # Maximum wait for a usable scan before a requested save, s; then the map is saved without one.
             unscanned = 1.0
             await self._clock.sleep(unscanned)
             async with self._one_step:
@@ -264,7 +265,7 @@ class SlamService:
                     self._report_saved(await self._step(worker, WorkerInput(save=self._config.save)))
 
     async def _step(self, worker: WorkerActor, work: WorkerInput) -> WorkerOutput:
-        """Run a shielded step: cancelling it would kill the worker, and with it the map that is still to be saved."""
+        """Run a step shielded from cancellation, which would kill the worker and lose the map before its save."""
         self._under_way = asyncio.ensure_future(worker.step(work))
         outputs: WorkerOutput = await asyncio.shield(self._under_way)
         return outputs
@@ -276,7 +277,7 @@ class SlamService:
         if not task.done():
             await task
         if self._config.save is not None and self._config.mode == "mapping" and task.exception() is None:
-            # Save it as it is first: the joint fit takes seconds that may not be available.
+            # Save the map as it is first: the joint registration takes seconds that may not be available.
             self._report_saved(await worker.step(WorkerInput(save=self._config.save)))
             self._report_saved(await worker.step(WorkerInput(save=self._config.save, finish=True)))
 
@@ -288,7 +289,7 @@ class SlamService:
         return None
 
     def _of_other(self) -> ScanInput | None:
-        """The latest scan of the second lidar, if it was not sent yet."""
+        """Return the latest scan of the second lidar unless it was sent already."""
         other = self._other
         scan = None if other is None else other.scan.latest
         if other is None or scan is None or scan is self._other_sent or self._unusable(scan) is not None:
@@ -312,7 +313,7 @@ class SlamService:
     def _motion(self, begin: int, end: int) -> tuple[Pose2 | None, Twist2]:
         """Return base in odom at ``begin``, and the velocity until ``end``; both in ns."""
         history = self._history
-        stale = SECOND // 5  # odometry older than the scan by more than this is not used, ns
+        stale = SECOND // 5  # maximum lag of odometry behind the scan, ns
         if not history or begin - history[-1][0] > stale or begin < history[0][0]:
             return None, (0.0, 0.0, 0.0)
         first = max(bisect_left(history, begin, key=lambda row: row[0]) - 1, 0)
@@ -327,7 +328,7 @@ class SlamService:
         return (x, y, yaw), (vx, vy, wz)
 
     def _start(self, odom: Pose2 | None) -> Pose2:
-        """Return the start pose of a new map: the current pose in map."""
+        """Return the initial pose of a new map: the current pose in map."""
         if odom is not None:
             return self._correction.pose(odom, 0.0)
         return (0.0, 0.0, 0.0) if self._newest is None else self._newest.pose
@@ -366,7 +367,7 @@ class SlamService:
             self._events(Reason.FILE_DAMAGED, Severity.WARNING, self.name, remark)
         if outputs.bases is not None:
             rows = zip(self._sent_instants, outputs.bases.tolist(), strict=True)
-            self._bases = {at: (x, y, yaw) for at, (x, y, yaw) in rows if x == x}  # NaN: not known
+            self._bases = {at: (x, y, yaw) for at, (x, y, yaw) in rows if x == x}  # NaN: unknown
         now = self._clock.now()
         self._changed |= bool(outputs.tiles)
         if outputs.whole is not None and outputs.whole.cells.size:
@@ -414,7 +415,7 @@ class SlamService:
             return
         before, self._status = self._status, estimate.status
         said, now = self._degenerate_said, self._clock.now()
-        # Minimum time between two events about scans that leave a direction undetermined, ns: in a corridor such scans
+        # Minimum time between two events about scans with an undetermined direction, ns: in a corridor such scans
         # alternate with others.
         quiet = 30 * SECOND
         if estimate.status is LocalisationStatus.DEGENERATE and (said is None or now - said >= quiet):
@@ -445,7 +446,7 @@ class SlamService:
 
 
 def carried_on(covariance: Array, before: Odometry, now: Odometry, turn: float) -> Array:
-    """Return the covariance, (9,), of a pose in map estimated at ``before`` and predicted by odometry until ``now``.
+    """Return the covariance, (9,), of a pose in map from ``before``, predicted by odometry until ``now``.
 
     Args:
         covariance: covariance at ``before``, (9,).
@@ -501,7 +502,7 @@ def scan_motion(stamp: int, moved: ScanIncrement, now: int, seq: int) -> ScanMot
 def slam_health(
     estimate: SlamEstimate, counts: Mapping[str, int], lost: tuple[int, int], now: int, seq: int
 ) -> SlamHealth:
-    """Return the match of the latest scan as health; ``lost`` is the number of scans not used and dropped."""
+    """Return the match of the latest scan as a health message; ``lost`` is the number of dropped and unused scans."""
     return SlamHealth(
         stamp=estimate.stamp,
         received=now,

@@ -1,6 +1,6 @@
-"""Saved maps: the grid (map_server: ``map.yaml``, ``map.png``) and the pose graph (``graph.npz``) of a save.
+"""Saved maps: grid (map_server: ``map.yaml``, ``map.png``) and pose graph (``graph.npz``) of one save.
 
-The graph holds keyframes, their poses and the edges between them as plain arrays, no pickles.
+The graph file holds keyframes, their poses and edges as plain arrays, without pickles.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ GRAPH: Final = "graph.npz"
 PICTURE: Final = "map.png"
 VERSION: Final = 1
 ELEMENTS: Final = tuple(field.name for field in dataclasses.fields(Scan))
-"""Arrays of a scan: of a file that was written before there were so many, the others are zeros."""
+"""Arrays of a scan; arrays missing in files of earlier versions are zeros."""
 _SHAPES: Final[dict[str, tuple[int, ...]]] = {
     "stamps": (),
     "poses": (3,),
@@ -66,7 +66,7 @@ class SavedMap:
 
     grid: WorldMap
     graph: SavedGraph | None
-    """Pose graph; None for a map of another program, which has a grid only."""
+    """Pose graph; None for a map of another program, which has only a grid."""
 
 
 def elements(points: Array, **known: Array) -> Scan:
@@ -97,7 +97,7 @@ def saved_graph(known: KeyframeMap) -> SavedGraph:
 
 
 def g2o_text(graph: SavedGraph) -> str:
-    """Return the graph as g2o text: ``VERTEX_SE2`` by number of the keyframe, the first one fixed, and ``EDGE_SE2``."""
+    """Return the graph as g2o text: ``VERTEX_SE2`` by keyframe number, the first one fixed, and ``EDGE_SE2``."""
     vertices = [f"VERTEX_SE2 {i} {x:.9g} {y:.9g} {yaw:.9g}" for i, (x, y, yaw) in enumerate(graph.poses.tolist())]
     corner = np.triu_indices(3)
     edges = [
@@ -113,21 +113,21 @@ def g2o_text(graph: SavedGraph) -> str:
 
 
 def trinary(patch: GridPatch) -> WorldMap:
-    """Free, occupied, unknown."""
+    """Grey values of free, occupied and unknown cells."""
     return WorldMap(patch.cells, patch.resolution, patch.origin).trinary()
 
 
 def save(folder: Path, patch: GridPatch, graph: SavedGraph | None, run: str = "") -> None:
-    """Write a save of a map.
+    """Save a map.
 
     Args:
         folder: folder of the map.
         patch: the whole grid.
         graph: keyframes; None or empty: the grid alone.
-        run: that made the map: what else it has saved here stays. Empty = a run of its own.
+        run: run that makes the map: other files it has saved here stay. An empty name makes this save a separate run.
 
     Raises:
-        InputError: there is nothing to save yet.
+        InputError: the map has no content to save.
         OSError: a file could not be written.
     """
     if not patch.cells.size:
@@ -158,7 +158,7 @@ def load(place: Path) -> SavedMap:
     """Read a saved map: its folder, or the YAML file of a map_server map.
 
     Raises:
-        InputError: file, key and expectation of whatever is wrong.
+        InputError: the map is invalid; the error names file, key and expected value.
     """
     folder = folder_of(place)
     if folder is None:
@@ -214,15 +214,15 @@ def _graph_of(path: Path, arrays: dict[str, NDArray[Any]]) -> SavedGraph:
 
 
 def _require_extent(path: Path, points: Array, poses: Array) -> None:
-    """Refuse surfaces so far apart that no grid holds them all.
+    """Refuse surfaces too far apart for a grid.
 
     Args:
-        path: file that they are read from.
-        points: in base, shape (n, 2).
+        path: source file, for the error.
+        points: points in base, shape (n, 2).
         poses: poses of the base in map for each point, shape (n, 3).
 
     Raises:
-        InputError: a grid of them would have more than ``MOST_CELLS``.
+        InputError: a grid of the points would exceed ``MOST_CELLS``.
     """
     if not len(points):
         return
@@ -235,15 +235,15 @@ def _require_extent(path: Path, points: Array, poses: Array) -> None:
 
 
 def surface_elements(grid: WorldMap) -> Scan:
-    """Surface elements in map of all walls next to free cells."""
+    """Return surface elements in map of all walls next to free cells."""
     step = grid.resolution
     cells, towards = _faces(grid.cells)
     if not len(cells):
         return elements(np.zeros((0, 2)), normals=np.zeros((0, 2)), variances=np.zeros((0, 2)))
-    normal_reach = 0.2  # faces up to this far away make the normal, m
-    normal_cells = 4.0  # minimum reach in cells: the steps of an oblique wall must be averaged
+    normal_reach = 0.2  # maximum distance of faces used for a normal, m
+    normal_cells = 4.0  # minimum reach in cells, to average the steps of an oblique wall
     normals, straight, aside = _fitted(cells, towards, max(normal_reach / step, normal_cells))
-    # A free cell next to a wall is one cell from the middle of the wall's cells.
+    # The centre of a free cell next to a wall is one cell from the centre of the wall's cell.
     points = (cells + aside - normals + 0.5) * step + np.array(grid.origin)
     across = 0.02**2 + step**2 / 12  # minimum standard deviation of a drawn wall, m
     variances = np.stack((np.full(len(points), across), np.where(straight, SLIDE**2, across)), axis=-1)
@@ -251,7 +251,7 @@ def surface_elements(grid: WorldMap) -> Scan:
 
 
 def _faces(cells: NDArray[np.int8]) -> tuple[Array, Array]:
-    """Free cells that share an edge with an occupied one (column, row), shape (n, 2); unit vectors away from those."""
+    """Return free cells next to an occupied one (column, row), shape (n, 2), and unit vectors away from the wall."""
     wall = np.pad(cells == OCCUPIED, 1).astype(np.float64)
     rows, columns = cells.shape
 
@@ -263,23 +263,23 @@ def _faces(cells: NDArray[np.int8]) -> tuple[Array, Array]:
     def slope(dx: int, dy: int) -> Array:
         return neighbour(-dx, -dy) - neighbour(dx, dy)
 
-    # Sobel's kernel: the stairs of an oblique wall give its direction roughly.
+    # Sobel kernel: estimates the rough direction of an oblique wall from its stairs.
     x = 2 * slope(1, 0) + slope(1, 1) + slope(1, -1)
     y = 2 * slope(0, 1) + slope(1, 1) + slope(-1, 1)
     length = np.hypot(x, y)
-    # In a gap one cell wide both sides cancel; it is left out.
+    # In a gap one cell wide both sides cancel; such cells are left out.
     at = np.nonzero((cells == FREE) & touching & (length > 0))
     free: Array = np.stack(at[::-1], axis=-1).astype(np.float64)
     return free, np.stack((x[at], y[at]), axis=-1) / length[at][:, None]
 
 
 def _fitted(cells: Array, towards: Array, reach: float) -> tuple[Array, NDArray[np.bool_], Array]:
-    """Normals, shape (n, 2), of lines through the faces near each; whether those are lines; steps (n, 2) onto them."""
+    """Fit lines to nearby faces; return normals (n, 2), whether each is a line, and steps (n, 2) onto the lines."""
     count = len(cells)
     first, second = cKDTree(cells).query_pairs(reach, output_type="ndarray").T
     here = np.concatenate((first, second, np.arange(count)))
     there = np.concatenate((second, first, np.arange(count)))
-    normal_agreement = 0.5  # cosine between first guesses of normals that may belong to one side of one wall
+    normal_agreement = 0.5  # minimum cosine between initial normals on one side of one wall
     same = (towards[here] * towards[there]).sum(axis=1) > normal_agreement
     here, there = here[same], there[same]
 
@@ -293,7 +293,7 @@ def _fitted(cells: Array, towards: Array, reach: float) -> tuple[Array, NDArray[
     cyy = total(off[:, 1] ** 2) / near - my * my
     cxy = total(off[:, 0] * off[:, 1]) / near - mx * my
     middle, half = (cxx + cyy) / 2, np.hypot((cxx - cyy) / 2, cxy)
-    straightness = 0.1  # faces lie on a line if they spread across it by less than this part of the variance along it
+    straightness = 0.1  # maximum ratio of the variances across and along a line of faces
     straight = (near >= 3) & (middle - half < straightness * (middle + half))
     angle = 0.5 * np.arctan2(2 * cxy, cxx - cyy)
     normals = np.stack((-np.sin(angle), np.cos(angle)), axis=-1)

@@ -1,4 +1,4 @@
-"""Scale of the wheels' distances by the scans: tyres, carpet and slip make them too long or too short."""
+"""Scale of the wheels' distances from the scans: worn tyres, carpet and slip change it."""
 
 import math
 
@@ -9,17 +9,17 @@ from monstertruck_kinematics.se2 import compose
 
 
 class WheelScale:
-    """Kalman filter of the scale, over stretches of a path that scans measure.
+    """Kalman filter of the scale, over stretches of the path measured by scans.
 
     Args:
-        deviation: standard deviation of the scale before it is measured.
+        deviation: standard deviation of the scale before its measurement.
         noise: standard deviation of the position at either end of a stretch (m).
     """
 
     def __init__(self, deviation: float, noise: float) -> None:
         self._prior, self._noise = deviation**2, noise * math.sqrt(2.0)
         self._stretch = 3.0 * self._noise / deviation
-        """Distance over which a stretch shows an error of ``deviation`` beyond chance (m)."""
+        """Length of a stretch over which an error of ``deviation`` becomes significant (m)."""
         self.reset()
 
     def reset(self) -> None:
@@ -29,15 +29,15 @@ class WheelScale:
 
     @property
     def factor(self) -> float:
-        """Factor on the wheels' distances: 1 if the deviation before any measurement explains their error."""
+        """Factor on the wheels' distances; 1 while the initial deviation explains their error."""
         return self.value if (self.value - 1.0) ** 2 > self._prior else 1.0
 
     def interrupt(self) -> None:
-        """Begin a new stretch: scans have not measured this motion."""
+        """Begin a new stretch after a motion that scans have not measured."""
         self._by_wheels, self._by_scans = np.zeros(3), np.zeros(3)
 
     def add(self, by_wheels: Array, by_scans: Array) -> None:
-        """Take the motion between two scans by both, shape (3,); the turn of the scans counts for both."""
+        """Add the motion between two scans by both, shape (3,); the scans' turn is used for both."""
         turned = np.array((*by_wheels[:2], by_scans[2]))
         self._by_wheels, self._by_scans = compose(self._by_wheels, turned), compose(self._by_scans, by_scans)
         driven, seen = self._by_wheels[:2], self._by_scans[:2]

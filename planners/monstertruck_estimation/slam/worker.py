@@ -1,6 +1,6 @@
 """SLAM worker for mapping or localisation: ``monstertruck_estimation.slam.worker:SlamWorker``.
 
-A step's inputs are a ``WorkerInput``, its outputs a ``WorkerOutput``; the first one brings the configuration.
+A step's input is a ``WorkerInput``, its output a ``WorkerOutput``; the first input carries the configuration.
 """
 
 from dataclasses import replace
@@ -25,7 +25,7 @@ from monstertruck_schemas.health import OdometryUse
 
 
 class SlamWorker:
-    """Worker step that holds the map; building it compiles all numba functions."""
+    """Worker step that holds the map; its construction compiles all numba functions."""
 
     def __init__(self) -> None:
         self._estimator: Estimator | None = None
@@ -39,7 +39,7 @@ class SlamWorker:
         """Execute one step.
 
         Raises:
-            InputError: no start came first.
+            InputError: the first input has no ``start``.
         """
         try:
             remarks = () if inputs.start is None else self._begin(inputs.start)
@@ -90,7 +90,7 @@ class SlamWorker:
         )
 
     def _begin(self, start: Start) -> tuple[str, ...]:
-        """Make the estimator; return remarks on the saved map it reads."""
+        """Build the estimator; return remarks on the saved map that it loads."""
         config = start.config
         settings = config.mapper
         self._run = start.run
@@ -104,7 +104,7 @@ class SlamWorker:
         return ()
 
     def _refusal(self, scan: ScanInput) -> tuple[ScanLeftOut, str] | tuple[None, None]:
-        """Return the reason why a scan cannot be used, without and with figures; None if it can."""
+        """Return the reason why a scan cannot be used, without and with figures; None if it can be used."""
         if self._first is None:
             self._first = scan
         elif not _same_field(scan, self._first):
@@ -162,7 +162,7 @@ def _warm_up() -> None:
     keyframes.optimise()
     finished(opposed(keyframes, np.array((0,)), np.array((len(keyframes) - 1,))))
     estimator.changes()
-    # A few scans of a small room do not cover loop closures and a saved map.
+    # A few scans of a small room do not cover loop closures and saved maps.
     points = scans[0].points
     describe(points)
     moved(View.of(points), View.of(scans[1].points), np.zeros(3))

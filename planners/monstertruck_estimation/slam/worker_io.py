@@ -37,13 +37,13 @@ class ScanInput:
     stamp: int
     """Stamp of the first beam (ns)."""
     ranges: Array
-    """Ranges, shape (n,) (m); +inf if the beam met nothing within the sensor's range, NaN if unknown."""
+    """Ranges, shape (n,) (m); +inf without a return within the sensor's range, NaN if unknown."""
     start_angle: float
     angle_increment: float
     range_min: float
     range_max: float
     time_increment: float = 0.0
-    """Seconds between neighbouring beams."""
+    """Time between neighbouring beams (s)."""
     mount: Pose2 = (0.0, 0.0, 0.0)
     """Planar pose of the sensor in base (m, rad)."""
     odom: Pose2 | None = None
@@ -51,17 +51,17 @@ class ScanInput:
     twist: Twist2 = (0.0, 0.0, 0.0)
     """Velocity of base during the scan (m/s, rad/s)."""
     slopes: tuple[float, float] | None = None
-    """Rise per metre along the sensor's x and y axis; None if unknown: assumed level."""
+    """Rise per metre along the sensor's x and y axis; None if unknown, which is treated as level."""
     height: float | None = None
-    """Height of the sensor above the ground (m); None if unknown: hits of the ground are not removed."""
+    """Height of the sensor above the ground (m); None if unknown: hits of the ground are then kept."""
     ceiling: float | None = None
     """Height of the ceiling above the ground (m)."""
     range_noise: float | None = None
-    """Standard deviation of a range close by (m); None if it is not known."""
+    """Standard deviation of a short range (m); None if unknown."""
 
     @classmethod
     def of(cls, scan: LaserScan, mount: Pose2) -> Self:
-        """Return the input with the message's data alone."""
+        """Return the input built from the message's data."""
         return cls(
             stamp=scan.stamp,
             ranges=np.where((scan.codes == VALID_BEAM) | (scan.codes <= NO_ECHO), scan.ranges, np.nan),
@@ -77,7 +77,7 @@ class ScanInput:
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Start of a worker."""
+    """Configuration of a new worker."""
 
     config: SlamConfig
     pose: Pose2 = (0.0, 0.0, 0.0)
@@ -85,29 +85,29 @@ class Start:
     body: tuple[float, float] | None = None
     """Length and width of the robot (m): the ground under it is free; None if unknown."""
     run: str = ""
-    """Run that makes the map, for its saves; if empty, every save is a separate run."""
+    """Run that makes the map, for its saves; an empty name makes every save a separate run."""
 
 
 @dataclass(frozen=True, slots=True)
 class WorkerInput:
-    """Work of one step; None and False for parts not requested."""
+    """Tasks of one step; None and False for parts not requested."""
 
     start: Start | None = None
     scan: ScanInput | None = None
     other: ScanInput | None = None
-    """Scan of the second lidar, which is drawn but not matched."""
+    """Scan of the second lidar, drawn but not matched."""
     tiles: bool = False
-    """Return the changed tiles."""
+    """Whether to return the changed tiles."""
     whole: bool = False
-    """Return the whole grid."""
+    """Whether to return the whole grid."""
     save: Path | None = None
-    """Folder to save the map to."""
+    """Folder for saving the map."""
     finish: bool = False
-    """First optimise all keyframes jointly (seconds of work)."""
+    """Whether to optimise all keyframes jointly first (seconds of work)."""
     trajectory: bool = False
-    """Return the poses of all scans."""
+    """Whether to return the poses of all scans."""
     instants: tuple[int, ...] = ()
-    """Instants at which to return the pose of base (ns)."""
+    """Stamps for which to return the pose of base (ns)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,10 +117,9 @@ class ScanIncrement:
     since: int
     """Stamp of the earlier scan (ns)."""
     motion: Pose2
-    """Base at the later one in base at the earlier one."""
+    """Base at the later match in base at the earlier one."""
     covariance: tuple[float, ...]
-    """Covariance of the later scan's pose in the map, in base's axes, row-major (3, 3); the earlier one's was sent
-    before."""
+    """Covariance of the later scan's pose in the map, in base's axes, row-major (3, 3); the earlier one came before."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,9 +141,9 @@ class SlamEstimate:
     verdict: str
     events: tuple[str, ...] = ()
     offset: float | None = None
-    """Lead of odometry over the scans (s); None if none was found."""
+    """Lead of odometry over the scans (s); None if not found."""
     mount_fault: str | None = None
-    """Fault of the lidar's mount; None if none is certain."""
+    """Fault of the lidar's mount; None without a certain fault."""
     moved: ScanIncrement | None = None
     """Motion since the last match; None for the first scan, and after rejected matches."""
     odometry: OdometryUse = OdometryUse.NONE
@@ -170,19 +169,19 @@ class WorkerOutput:
     tiles: tuple[GridPatch, ...] = ()
     whole: GridPatch | None = None
     counts: dict[str, int] = field(default_factory=dict)
-    """Scans, keyframes, closures, rejected matches since the start."""
+    """Numbers of scans, keyframes, closures and rejected matches since the start."""
     saved: str | None = None
     error: str | None = None
     """Reason why the map could not be saved."""
     trajectory: tuple[NDArray[np.int64], Array] | None = None
-    """Stamps (n,) (ns), and poses (n, 3) of base in map at the first beam of every scan; None in a saved map."""
+    """Stamps (n,) (ns) and poses (n, 3) of base in map at the first beam of every scan; None for a saved map."""
     on_map: NDArray[np.bool_] | None = None
     """Whether each scan of ``trajectory`` belongs to the map, not to a submap that is not joined to it, shape (n,)."""
     bases: Array | None = None
-    """Shape (n, 3): base in map at the instants requested; NaN where it is not known; None in a saved map."""
+    """Base in map at the requested stamps, shape (n, 3); NaN where unknown; None for a saved map."""
     joint: bool | None = None
-    """After ``finish``: whether the joint registration was kept, for it agreed better than the graph."""
+    """After ``finish``: whether the joint registration was kept because it agreed better than the graph."""
     remarks: tuple[str, ...] = ()
-    """Remarks on the saved map read in this step."""
+    """Remarks on the saved map loaded in this step."""
     unreadable: str | None = None
-    """Why the saved map cannot be read; nothing else was done then."""
+    """Reason why the saved map cannot be loaded; the step then did no other work."""

@@ -1,1 +1,1 @@
-"""Computer vision: needs the extra ``vision``, and is loaded on use only."""
+"""Computer vision; requires the extra ``vision``, which is loaded on first use."""

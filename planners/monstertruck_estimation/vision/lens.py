@@ -1,8 +1,8 @@
-"""Lenses: from pixels to directions, and how they are found from pictures of a flat board.
+"""Lens model: conversion of pixels to directions, and calibration from images of a flat board.
 
-The lens is Brown's (two radial and two tangential terms, a third radial one that stays 0). It is found from pictures of
-a board held anyhow: Zhang, "A flexible new technique for camera calibration", IEEE Transactions on Pattern Analysis and
-Machine Intelligence, 2000; by OpenCV's ``calibrateCameraExtended``.
+The lens model is Brown's (two radial and two tangential terms; the third radial one stays 0). It is fitted to images of
+a board held at any angle: Zhang, "A flexible new technique for camera calibration", IEEE Transactions on Pattern
+Analysis and Machine Intelligence, 2000; by OpenCV's ``calibrateCameraExtended``.
 """
 
 import math
@@ -20,9 +20,9 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.body import LensConfig
 
 LEAST_BOARDS: Final = 6
-"""Pictures of the board."""
+"""Images of the board."""
 PARAMETERS: Final = ("focal_x", "focal_y", "centre_x", "centre_y", "k1", "k2", "p1", "p2")
-"""Parameters of a lens that are fitted, in OpenCV's order."""
+"""Fitted lens parameters in OpenCV's order."""
 
 
 @dataclass(frozen=True)
@@ -30,15 +30,15 @@ class Lens:
     """Projection of a camera."""
 
     matrix: Array
-    """(3, 3), pixels."""
+    """Camera matrix, shape (3, 3) (pixels)."""
     distortion: Array
-    """(5,): k1, k2, p1, p2, k3."""
+    """Distortion k1, k2, p1, p2, k3, shape (5,)."""
     size: tuple[int, int]
-    """Width and height, pixels."""
+    """Width and height (pixels)."""
 
     @classmethod
     def of(cls, config: LensConfig, width: int, height: int) -> "Lens":
-        """Build it as configured, also for pictures of another size than in the calibration."""
+        """Build a lens from the configuration, also for images of another size than in the calibration."""
         across, up = width / config.width, height / config.height
         matrix = np.array(
             (
@@ -51,40 +51,40 @@ class Lens:
         return cls(matrix, distortion, (width, height))
 
     def directions(self, pixels: Array) -> Array:
-        """X and y of the rays through pixels at z = 1 of the camera; (n, 2) both."""
+        """Return x and y of the rays through pixels at z = 1 of the camera; (n, 2) both."""
         points = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
         return np.asarray(cv2.undistortPoints(points, self.matrix, self.distortion)).reshape(-1, 2)
 
     @property
     def parameters(self) -> Array:
-        """``PARAMETERS``, (8,)."""
+        """Return the values of ``PARAMETERS``, (8,)."""
         (fx, _, cx), (_, fy, cy), _ = self.matrix.tolist()
         return np.array((fx, fy, cx, cy, *self.distortion[:4]))
 
 
 class LensFit(NamedTuple):
-    """A lens, and how well it is known."""
+    """A lens with its uncertainty."""
 
     lens: Lens
     sigmas: Array
-    """(8,): standard deviations of ``PARAMETERS``, by the corners' noise or by how views disagree, the larger one."""
+    """Standard deviations of ``PARAMETERS``, (8,): the larger of corner noise and scatter between views."""
     rms: float
-    """RMS residual of the corners, pixels: both axes together."""
+    """RMS residual of the corners (pixels), both axes together."""
     corners: int
     by_view: tuple[float, ...]
-    """The same of each view, pixels."""
+    """RMS residual of each view (pixels)."""
 
 
 def fit_lens(views: Sequence[BoardSighting], reader: BoardReader, size: tuple[int, int]) -> LensFit:
-    """A lens from sightings of a board.
+    """Fit a lens to sightings of a board.
 
     Args:
         views: views of the board.
-        reader: that found them.
-        size: width and height of the pictures, pixels.
+        reader: reader that found them.
+        size: width and height of the images (pixels).
 
     Raises:
-        InputError: too few of them, or none of them tilted.
+        InputError: too few sightings, or none of them tilted.
     """
     if len(views) < LEAST_BOARDS:
         raise InputError(f"the board is visible in {len(views)} images: expected {LEAST_BOARDS}")
@@ -106,14 +106,15 @@ def fit_lens(views: Sequence[BoardSighting], reader: BoardReader, size: tuple[in
 
 
 def sigmas_by_view(views: Sequence[tuple[Array, Array, Array]]) -> Array:
-    """Standard deviations of a lens's parameters by how views disagree, (8,).
+    """Return the standard deviations of a lens's parameters from the scatter between views, (8,).
 
-    Errors of the corners of a view may be correlated (a bent board, an edge that pixels cut slantwise), so only views
-    are independent measurements: the covariance by clusters of Liang and Zeger ("Longitudinal data analysis using
-    generalized linear models", Biometrika 1986), with their number's correction.
+    The corner errors of one view may be correlated (a bent board, an edge at a slant to the pixels), so only views are
+    independent measurements. The covariance by clusters follows Liang and Zeger ("Longitudinal data analysis using
+    generalized linear models", Biometrika 1986), corrected for the number of clusters.
 
     Args:
-        views: by view, slopes by the parameters of the lens (2 n, 8) and of the pose (2 n, 6), and residuals (2 n,).
+        views: per view, derivatives by the parameters of the lens (2 n, 8) and of the pose (2 n, 6), and residuals (2
+            n,).
     """
     information, scores = np.zeros((len(PARAMETERS), len(PARAMETERS))), []
     for by_lens, by_pose, off in views:
@@ -129,14 +130,14 @@ def sigmas_by_view(views: Sequence[tuple[Array, Array, Array]]) -> Array:
 def _slopes(
     view: BoardSighting, reader: BoardReader, lens: Lens, turn: Array, place: Array
 ) -> tuple[Array, Array, Array]:
-    """Inputs of ``sigmas_by_view``."""
+    """Return the inputs of ``sigmas_by_view``."""
     shown, slopes = cv2.projectPoints(reader.points[view.ids], turn, place, lens.matrix, lens.distortion)
     found = np.asarray(slopes, dtype=np.float64)
     return found[:, 6 : 6 + len(PARAMETERS)], found[:, :6], (view.corners - np.asarray(shown).reshape(-1, 2)).ravel()
 
 
 def lens_from_pictures(pictures: Sequence[Picture], reader: BoardReader) -> tuple[LensFit, int]:
-    """A lens from pictures of a board, and how many of them showed it; raises as ``fit_lens``."""
+    """Fit a lens to images of a board; return it with the number of usable images. Raises as ``fit_lens``."""
     views = [view for picture in pictures if (view := reader.read(picture)) is not None]
     if len(views) < LEAST_BOARDS:
         raise InputError(f"the board is visible in {len(views)} of {len(pictures)} images: expected {LEAST_BOARDS}")
@@ -145,28 +146,28 @@ def lens_from_pictures(pictures: Sequence[Picture], reader: BoardReader) -> tupl
 
 
 class BoardPose(NamedTuple):
-    """Pose of a board in front of a camera."""
+    """Pose of a board relative to a camera."""
 
     axes: Array
-    """(3, 3), columns: its right, its down, and away from its face, in the camera's axes."""
+    """Rotation, (3, 3): columns are the board's right, down, and backward axes in the camera's axes."""
     place: Array
-    """(3,): its upper left corner, m."""
+    """Upper left corner, (3,) (m)."""
     rms: float
-    """RMS residual of the corners, pixels."""
+    """RMS residual of the corners (pixels)."""
 
     @property
     def turn(self) -> float:
-        """Turn about the vertical, rad: positive if its left edge is nearer."""
+        """Turn about the vertical (rad); positive if the left edge is nearer."""
         return math.atan2(-float(self.axes[0, 2]), float(self.axes[2, 2]))
 
     @property
     def lean(self) -> float:
-        """Lean, rad: positive if its upper edge is nearer."""
+        """Lean (rad); positive if the upper edge is nearer."""
         return math.atan2(-float(self.axes[1, 2]), float(self.axes[2, 2]))
 
 
 def board_pose(view: BoardSighting, reader: BoardReader, lens: Lens) -> BoardPose | None:
-    """Pose of a board (Collins and Bartoli's solution, refined); None if no pose fits."""
+    """Return the pose of a board (Collins and Bartoli's solution, refined); None if no pose fits."""
     points = reader.points[view.ids]
     fine, turn, place = cv2.solvePnP(points, view.corners, lens.matrix, lens.distortion, flags=cv2.SOLVEPNP_IPPE)
     if not fine:

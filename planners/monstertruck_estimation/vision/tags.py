@@ -1,8 +1,8 @@
-"""Tags in a picture: the one place where they are read (Olson, "AprilTag", ICRA 2011; ArUco by its dictionaries).
+"""Tag detection, shared by all readers (Olson, "AprilTag", ICRA 2011; ArUco by its dictionaries).
 
-OpenCV's ArUco module finds them; corners are crossings of lines along the edges, to a part of a pixel. A tag that stays
-in view is looked for around its last place and where it is expected, and everywhere once in a while, which lets one
-core read several cameras.
+OpenCV's ArUco module detects the tags; corners are the intersections of lines along the edges, to a fraction of a
+pixel. A tag in view is searched for around its last and its expected place, and once in a while in the whole image.
+This lets one core read several cameras.
 """
 
 from collections.abc import Collection, Sequence
@@ -16,23 +16,22 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_schemas.board import TagFamily
 
 Picture = NDArray[np.uint8]
-"""Grey, (height, width)."""
+"""Grey image, shape (height, width)."""
 
 EVERYWHERE: Final = 8
-"""Pictures from one look at the whole of it to the next: a tag that appears is found in the one after so many at the
-latest, also where it was not expected."""
+"""Interval between searches of the whole image, in images: a tag that appears unexpectedly is found within it."""
 
 
 class Sighting(NamedTuple):
-    """A tag in a picture."""
+    """A tag in an image."""
 
     tag: int
     corners: Array
-    """(4, 2), pixels: of the black square, clockwise as printed, from its upper left one."""
+    """Corners of the black square, (4, 2) (pixels), clockwise as printed, from its upper left."""
 
     @property
     def size(self) -> float:
-        """Mean side, pixels."""
+        """Mean side (pixels)."""
         return _side(self.corners)
 
 
@@ -41,14 +40,14 @@ def _side(corners: Array) -> float:
 
 
 class TagReader:
-    """Reads the tags of one camera's pictures.
+    """Detects the tags in one camera's images.
 
     Args:
         everywhere: every how many pictures the whole picture is searched, beginning with the first.
-        still: tags that do not move: they are read in whole pictures only.
-        corners: how they are found: as crossings of lines along the edges, which bears tags of few pixels a cell and
-            dirt, or to a tenth of a pixel as crossings of the edges of the picture itself, for tags that are measured.
-        phase: which ones of the pictures are looked at as a whole: cameras that are read side by side take turns.
+        still: whether tags never move; only whole images are then searched.
+        corners: corner detection: as intersections of lines along the edges, which tolerates few pixels per cell and
+            dirt; or, for precise tags, to a tenth of a pixel as intersections of the edges in the original image.
+        phase: offset of the searches of whole images, which lets cameras read side by side take turns.
         family: family of the tags.
     """
 
@@ -64,7 +63,7 @@ class TagReader:
         self._still = frozenset(still)
         parameters = cv2.aruco.DetectorParameters()
         if corners == "lines":
-            # A window around a corner takes in cells of a small tag.
+            # A window around a corner would include cells of a small tag.
             parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
         else:
             parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
@@ -80,11 +79,11 @@ class TagReader:
         self._last: dict[int, Sighting] = {}
 
     def read(self, picture: Picture, expected: Sequence[Array] = ()) -> list[Sighting]:
-        """Tags of the next picture.
+        """Return the tags of the next image.
 
         Args:
-            picture: next one.
-            expected: corners of tags, (4, 2) each, pixels, where others say that they are.
+            picture: next image.
+            expected: corners of tags where other cameras predict them, (4, 2) each (pixels).
         """
         whole = self._count == 0 or (self._count - self._phase) % self._everywhere == 0
         self._count += 1
@@ -99,13 +98,12 @@ class TagReader:
             found = [sighting._replace(corners=along_edges(picture, sighting.corners)) for sighting in found]
         by_tag = {sighting.tag: sighting for sighting in found}
         moving = {tag: sighting for tag, sighting in by_tag.items() if tag not in self._still}
-        # One that was missed is looked for where it was until the whole picture is looked at.
+        # A missed tag is searched for at its last place until the next search of the whole image.
         self._last = moving if whole else self._last | moving
         return list(by_tag.values())
 
     def _detect(self, picture: Picture, x0: int, y0: int) -> list[Sighting]:
-        # 32: minimum outline of a tag in pixels, one for each of its cells: smaller outlines are noise, and each costs
-        # time
+        # 32: minimum outline of a tag in pixels, one per cell; smaller outlines are noise, and each costs time
         self._parameters.minMarkerPerimeterRate = 32 / max(picture.shape)
         self._detector.setDetectorParameters(self._parameters)
         corners, ids, _ = self._detector.detectMarkers(picture)
@@ -118,27 +116,28 @@ class TagReader:
 
 
 ACROSS: Final = np.linspace(-2.5, 2.5, 21)
-"""Pixels from an edge, over which its step is looked for."""
+"""Maximum distance from an edge in the search for its step (pixels)."""
 
 
 def along_edges(picture: Picture, corners: Array) -> Array:
-    """Corners as crossings of the lines through the steps of the picture along each edge, (4, 2).
+    """Return corners as intersections of the lines through the steps along each edge, (4, 2).
 
-    OpenCV's own ones lie inwards of the true ones: at 35 pixels a side a tag seems 1.4 % smaller, so more distant.
+    OpenCV's own corners lie inside the true ones: a tag with sides of 35 pixels seems 1.4 % smaller, hence more
+    distant.
     """
     lines = []
     for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         length = float(np.hypot(*(end - start)))
         along = (end - start) / length
         across = np.array((along[1], -along[0]))
-        sharp_part = (0.12, 0.88)  # part of an edge that is looked at: its ends are rounded by blur
+        sharp_part = (0.12, 0.88)  # used part of an edge: blur rounds its ends
         points = start + np.linspace(*sharp_part, max(8, int(length)))[:, None] * length * along
         samples = (points[:, None] + ACROSS[:, None] * across).astype(np.float32)
         values = np.asarray(cv2.remap(picture, samples, None, cv2.INTER_LINEAR), dtype=np.float64)
         steps = np.abs(np.diff(values, axis=1))
         middles = (ACROSS[1:] + ACROSS[:-1]) / 2
         off = (steps**2 @ middles) / np.maximum((steps**2).sum(axis=1), 1e-9)
-        clear = steps.max(axis=1) > 3.0  # least step of an edge from sample to sample, of 255
+        clear = steps.max(axis=1) > 3.0  # minimum step of an edge from sample to sample, of 255
         if clear.sum() < 4:
             return corners
         # 0.7: maximum distance of a sample from its edge, pixels
@@ -165,22 +164,21 @@ def dictionary(family: TagFamily = "36h11") -> "cv2.aruco.Dictionary":
 
 
 def cells(family: TagFamily = "36h11") -> int:
-    """Return the cells of a tag's black square along a side."""
+    """Return the number of cells along a side of a tag's black square."""
     return int(dictionary(family).markerSize) + 2
 
 
 def drawn(tag: int, pixels: int, family: TagFamily = "36h11") -> Picture:
-    """A tag to be printed, its white rim left aside; (pixels, pixels)."""
+    """Return a printable tag without its white margin, (pixels, pixels)."""
     return np.asarray(cv2.aruco.generateImageMarker(dictionary(family), tag, pixels), dtype=np.uint8)
 
 
 def _windows(places: Sequence[Array], width: int, height: int) -> list[tuple[int, int, int, int]]:
-    """Boxes around the corners of each tag, overlapping ones joined: x0, y0, x1, y1, pixels."""
+    """Return boxes around the corners of each tag, overlapping ones merged: x0, y0, x1, y1 (pixels)."""
     boxes: list[tuple[int, int, int, int]] = []
     for corners in places:
-        # 16: pixels
-        # 1.0: margin of the window around a tag on each side, in sizes of the tag: how far it may move between two
-        # pictures
+        # 16: pixels 1.0: margin of the window on each side of a tag, in tag sizes: its maximum motion between two
+        # images
         margin = max(16, round(1.0 * _side(corners)))
         low, high = corners.min(axis=0), corners.max(axis=0)
         box = (
@@ -190,7 +188,7 @@ def _windows(places: Sequence[Array], width: int, height: int) -> list[tuple[int
             min(int(high[1]) + margin, height),
         )
         if box[0] >= box[2] or box[1] >= box[3]:
-            continue  # out of the picture
+            continue  # outside the image
         while (other := next((b for b in boxes if _overlap(b, box)), None)) is not None:
             boxes.remove(other)
             box = (min(box[0], other[0]), min(box[1], other[1]), max(box[2], other[2]), max(box[3], other[3]))
