@@ -63,9 +63,7 @@ class Geometry(Schema):
     """Dimensions of the truck's body (default: the author's robot)."""
 
     wheelbase: Metres = 0.32
-    """Distance between front and rear axle, m; for a body without axles, the wheelbase of the bicycle model used in
-    requests
-    """
+    """Distance between front and rear axle, m; without axles, of the bicycle model in requests"""
     track: Metres = 0.26
     """Distance between left and right wheel centres, m"""
     wheel_radius: Metres = 0.075

@@ -168,7 +168,7 @@ def test_the_commands_follow_a_goal_and_a_path_and_tell_how_they_end(tmp_path: P
             await drive_to(driver, trip.clock, (3.3, 3.9, 0.0), [(2.7, 3.85)], arm=True)
         ).reason is Reason.GOAL_REACHED
         assert Reason.WAYPOINT_PASSED in trip.reasons()
-        with pytest.raises(RequestRefusedError, match="off the map"):
+        with pytest.raises(RequestRefusedError, match="outside the map"):
             await drive_to(driver, trip.clock, (30.0, 3.9, 0.0), arm=True)
         trip.states.drain()
         driving = asyncio.create_task(drive_to(driver, trip.clock, (8.5, 3.9, 0.0), arm=True))

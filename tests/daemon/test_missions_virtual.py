@@ -59,7 +59,7 @@ def test_a_mission_is_driven_and_followed():
     assert [line.partition("step ")[2][:1] for line in lines if " step " in line] == list("123456")
     others = [line for line in lines if " step " not in line]
     assert len(others) == 1, others
-    assert " s  it failed: " in others[0]
+    assert " s  failed: " in others[0]
     assert_at(rig, 1.0, 3.95, 0.0)
 
 

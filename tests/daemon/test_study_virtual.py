@@ -90,7 +90,7 @@ def test_a_loss_of_the_controller_stops_all_wheels_and_ends_the_run(tmp_path: Pa
                 rig.ports["wheels"].unplug()
 
             task = asyncio.create_task(unplug())
-            with pytest.raises(RequestRefusedError, match="stopped on the way"):
+            with pytest.raises(RequestRefusedError, match="stopped during the run"):
                 await runs.drive(operator, clock, config, runs.circle_plan(config, 2.0, 1.57, 2.0))
             await task
             await clock.sleep(0.5)

@@ -49,7 +49,7 @@ function intervals(row) {
 /**
  * Measurements as points, and the fit to them as a curve, between axes with the ends of their ranges.
  *
- * @param {{name: string, x: string, y: string, points: number[][], curve: number[][] | null}} plot
+ * @param {{name: string, x: string, y: string, points: [number, number][], curve: [number, number][] | null}} plot
  */
 function plotted({ name, x, y, points, curve }) {
   const all = [...points, ...(curve ?? [])];

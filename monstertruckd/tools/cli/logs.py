@@ -309,7 +309,7 @@ def finish_log(log: Path, fault: str | None) -> None:
     from monstertruckd.recorder.repair import in_use
 
     if fault is not None and not in_use(log):
-        finish(Reason.LOG_DAMAGED, f"{log}: {fault}; only the intact part was used ({RECOVER})")
+        finish(Reason.LOG_DAMAGED, f"{log}: {fault}; the intact part was used ({RECOVER})")
 
 
 @contextmanager

@@ -77,7 +77,7 @@ async def test_a_robot_that_is_not_there_is_an_error_that_is_tried_again():
 @pytest.mark.parametrize(
     ("name", "error", "said"),
     [
-        ("anna", NotFoundError, "no robot 'anna' at .*; there is ann"),
+        ("anna", NotFoundError, "no robot 'anna' at .*; found: ann"),
         ("ann", NoAnswerError, "robot 'ann' at .* has published no pose for 0.2 s"),
     ],
 )

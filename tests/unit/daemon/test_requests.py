@@ -72,5 +72,5 @@ def test_a_warning_that_was_seen_is_an_event(text: str | None, seen: bool):
     acknowledge = acknowledging(lambda *event, **values: events.append((*event, values)))
     with nullcontext() if seen else pytest.raises(InputError, match="1 to 200 printable"):
         asyncio.run(acknowledge({"text": text, "source": "ann"}))
-    expected = (Reason.ACKNOWLEDGED, Severity.INFO, "operator", "ann has seen: tilt", {"by": "ann"})
+    expected = (Reason.ACKNOWLEDGED, Severity.INFO, "operator", "ann acknowledged: tilt", {"by": "ann"})
     assert events == ([expected] if seen else [])

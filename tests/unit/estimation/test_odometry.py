@@ -213,7 +213,7 @@ def test_a_compass_of_the_wrong_sign_is_found_by_its_turns_and_taken_back():
     assert truck.reckoning.doubt is None
     truck.drive(0.2, 0.04, -0.04, 6.0)  # so slowly that no heading is far off
     assert truck.reckoning.rejected_headings == 0
-    assert "wrong sign" in truck.reckoning.doubt
+    assert "check the compass's sign" in truck.reckoning.doubt
     assert truck.error()[1] < 0.01
     x, y, _ = spread(truck.estimate.pose_covariance)
     assert truck.error()[0] < 3 * math.hypot(x, y)

@@ -111,7 +111,7 @@ def test_one_bad_encoder_is_named_taken_back_and_the_other_one_goes_on(side, sha
 
 @pytest.mark.parametrize(
     ("shares", "said"),
-    [((0.0, 0.0), "left is stuck, right is stuck"), ((-1.0, -1.0), "wrong way"), ((2.0, 2.0), "rolls")],
+    [((0.0, 0.0), "left is stuck, right is stuck"), ((-1.0, -1.0), "wrong direction"), ((2.0, 2.0), "rolls")],
 )
 def test_without_both_the_drive_carries_on(shares, said):
     truck = Tricycle()
@@ -129,13 +129,13 @@ def test_without_both_the_drive_carries_on(shares, said):
 def test_exchanged_encoders_show_in_a_turn():
     verdict = judged((0.2, 0.6), (0.6, 0.2), 0.4, 0.1, EncoderConfig())
     assert verdict.trusted == (False, False)
-    assert "exchanged" in verdict.text
+    assert "swapped" in verdict.text
 
 
 def test_a_robot_that_turns_otherwise_than_steered_is_believed_and_said():
     verdict = judged((0.2, 0.6), (0.4, 0.4), 0.4, 0.1, EncoderConfig())
     assert verdict.trusted == (True, True)
-    assert "turns otherwise" in verdict.text
+    assert "does not turn as steered" in verdict.text
     assert not verdict.slips
 
 

@@ -78,7 +78,7 @@ def test_a_download_comes_in_chunks_at_a_limited_rate_and_goes_on_where_it_was_b
 def test_one_source_downloads_at_a_time(folder: Path):
     async def scenario(call, clock):
         await call("recording_read", name="run-000001-000.mcap")
-        with pytest.raises(BusyError, match="ann downloads"):
+        with pytest.raises(BusyError, match="ann is downloading"):
             await call("recording_read", name="run-000001-000.mcap", source="bob")
         await clock.sleep(TURN + 0.1)
         await call("recording_read", name="run-000001-000.mcap", source="bob")
@@ -104,7 +104,7 @@ def test_what_is_not_listed_is_neither_read_nor_deleted(folder: Path, name):
 
 def test_a_recording_is_deleted_with_an_event_and_the_one_being_written_is_not(folder: Path):
     async def scenario(call, _):
-        with pytest.raises(BusyError, match="being written"):
+        with pytest.raises(BusyError, match="is writing it"):
             await call("recording_delete", name="run-000002-000.mcap")
         with pytest.raises(InputError):
             await call("recording_read", name="run-000002-000.mcap", offset=-1)
@@ -123,7 +123,7 @@ def test_what_another_daemon_writes_is_open_and_stays(folder: Path):
         ):
             fcntl.flock(other, fcntl.LOCK_EX)
             fcntl.flock(reader, fcntl.LOCK_SH)
-            with pytest.raises(BusyError, match="being written"):
+            with pytest.raises(BusyError, match="is writing it"):
                 await call("recording_delete", name="run-000001-000.mcap")
             assert in_use(folder / "run-000001-000.mcap")
             assert not in_use(folder / "run-000002-000.mcap")

@@ -88,7 +88,7 @@ def test_the_case_of_the_hole(tmp_path):
     assert len(read(file)) == 240
     assert str(done) == (
         f"{file}: 240 messages kept, 160 lost (0.8 to 1.6 s after its start); it cannot be read in 1 place, "
-        f"holds 240 of 400 messages; the original is {file}.damaged"
+        f"contains 240 of 400 messages; the original is {file}.damaged"
     )
     assert Path(f"{file}.damaged").read_bytes() == ZEROS.read_bytes()
     assert recover(file, file) == replace(done, messages=240, lost=0, spans=(), damage=None, original=None)
@@ -154,7 +154,7 @@ def test_a_chunk_that_is_there_twice_is_kept_once(tmp_path, logs):
     done = recover(file, file)
     assert read(file) == [row for _, rows in log.chunks for row in rows]
     assert done.repeated == 1
-    assert done.damage == "holds 1 chunk twice, has a damaged index"
+    assert done.damage == "contains 1 chunk twice, has a damaged index"
 
 
 def test_sectors_that_the_disk_refuses_are_a_hole(tmp_path, logs, monkeypatch):

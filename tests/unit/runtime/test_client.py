@@ -272,7 +272,7 @@ async def test_it_says_how_long_it_really_waited(monkeypatch):
 
 async def test_who_asks_for_another_robot_learns_which_one_is_there():
     async with running_robot(robot="sonar") as robot, TruckClient("truck", robot.endpoint, timeout=0.5) as client:
-        with pytest.raises(NotFoundError, match=r"no robot 'truck' at tcp/\S+; there is sonar \(--robot NAME\)$"):
+        with pytest.raises(NotFoundError, match=r"no robot 'truck' at tcp/\S+; found: sonar \(--robot NAME\)$"):
             await client.call("config")
 
 

@@ -144,7 +144,7 @@ def test_settings_of_another_distribution_travel_to_another_machine(install):
 
     codec, top = StepCodec(Task), catalog["top"].settings_class()
     assert codec.from_json(codec.to_json(Task(top(kind="top", turns=7)))) == Task(top(kind="top", turns=7))
-    with pytest.raises(InputError, match="no Plugin travels"):
+    with pytest.raises(InputError, match="a Plugin cannot be sent to another machine"):
         codec.to_json(catalog["top"])
 
 

@@ -20,4 +20,4 @@ async def test_why_a_router_shows_no_robots_is_said_once(caplog: pytest.LogCaptu
     with suppress(asyncio.CancelledError):
         await watching
     warned = [record.message for record in caplog.records if record.levelname == "WARNING"]
-    assert warned == [f"no robots from {endpoint}: no answer from {endpoint} within 0.05 s"]
+    assert warned == [f"no robots from {endpoint}: nothing answers at {endpoint} within 0.05 s"]

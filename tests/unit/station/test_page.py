@@ -1059,7 +1059,7 @@ async def the_guide_help_and_keys_explain_the_page_and_never_cover_the_emergency
     assert await page.locator(".pointed-at").count() == 0
     assert await page.evaluate("localStorage.guided") == "yes"
     await page.click("#pane-drive .help summary")
-    await expect(page.locator("#pane-drive .help p")).to_contain_text("letting go stops the robot")
+    await expect(page.locator("#pane-drive .help p")).to_contain_text("release them to stop")
     await page.click("#pane-drive .help summary")
     panes = await page.locator("[role=tabpanel]").count()
     assert await page.locator("[role=tabpanel] > .help").count() == panes, "each has its help"

@@ -106,6 +106,6 @@ def test_what_is_no_link_keeps_its_name(own: Path):
     port.parent.mkdir(parents=True)
     own.chmod(0o750)
     port.write_text("mine")
-    with pytest.raises(InputError, match="no link"), claimed(port):
+    with pytest.raises(InputError, match="is not a link"), claimed(port):
         pass
     assert port.read_text() == "mine"

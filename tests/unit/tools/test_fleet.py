@@ -35,7 +35,7 @@ def test_robots_of_one_world_have_noise_of_their_own():
 def test_two_robots_of_one_name_are_refused():
     with pytest.raises(InputError) as caught:
         as_fleet([LEADER, LEADER])
-    assert "robot leader: of leader and of leader" in str(caught.value)
+    assert "robot leader: used by leader and leader" in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -43,14 +43,14 @@ def test_two_robots_of_one_name_are_refused():
     [
         (
             {"devices": {"lidar": {"port": {"path": LEADER.devices.lidar.port.path}}}},
-            "leader/lidar: of leader and of second",
+            "leader/lidar: used by leader and second",
         ),
-        ({"zenoh": {"listen": ("tcp/127.0.0.1:7447",)}}, "zenoh.listen tcp/127.0.0.1:7447: of leader and of second"),
+        ({"zenoh": {"listen": ("tcp/127.0.0.1:7447",)}}, "zenoh.listen tcp/127.0.0.1:7447: used by leader and second"),
         ({"state_directory": Path("runs/leader/state")}, "state_directory runs/leader/state"),
         ({"sim": {"world": {"map": "rooms"}}}, "second: sim.world.map is rooms: expected the value of leader, yard"),
         (
             {"sim": {"world": {"engine": "mujoco"}}},
-            "second: sim.world.engine is mujoco: expected that of leader, plane",
+            "second: sim.world.engine is mujoco: expected the value of leader, plane",
         ),
         ({"sim": {"world": {"rough": ({"x": 1.0, "y": 0.0},)}}}, "second: sim.world.rough is (RoughPatch(x=1.0"),
         ({"sim": {"world": {"people": ({},)}}}, "second: sim.world.people: expected none, or the same as leader"),
@@ -82,8 +82,8 @@ def test_a_command_names_the_robot_then_the_device():
     robots.command(["a", "lidar", "unplug"])
     robots.command(["drive", "plug"])  # the only robot may be left out
     assert (one.words, two.words) == ([["unplug"]], [["plug"]])
-    with pytest.raises(InputError, match="name a device first: lidar, drive"):
+    with pytest.raises(InputError, match="start the line with a device: lidar, drive"):
         robots.command(["a", "plug"])
     several = CommandedGroup("robot", {"a": one, "b": two})
-    with pytest.raises(InputError, match="name a robot first: a, b"):
+    with pytest.raises(InputError, match="start the line with a robot: a, b"):
         several.command(["lidar", "plug"])

@@ -155,7 +155,7 @@ def test_a_controller_that_does_not_follow_is_reported_once_after_two_seconds():
             assert len(reported) == 1
             assert reported[0][1] is Severity.WARNING
             assert reported[0][2].startswith("controller stays in ")
-            assert reported[0][2].endswith(", wanted ENABLED")
+            assert reported[0][2].endswith(", expected ENABLED")
 
     on_bench(test)
 

@@ -178,7 +178,7 @@ def test_a_wrong_device_is_refused(device):
         port.plug()
         rig = Rig(clock, port, MaestroConfig())
         async with background(device(port.device, clock)):
-            with pytest.raises(WrongDeviceError, match="/dev/test: no Maestro"):
+            with pytest.raises(WrongDeviceError, match="/dev/test: not a Maestro"):
                 await rig.session()
         assert rig.ready_at == []
 

@@ -319,7 +319,7 @@ def test_another_device_is_refused():
 
         rig.emulator.inject("silent", "on")
         task = asyncio.create_task(chatter())
-        with ended(WrongDeviceError, "no STEP4"):
+        with ended(WrongDeviceError, "not STEP4"):
             await rig.session()
         task.cancel()
 

@@ -209,5 +209,5 @@ def test_a_compass_of_the_wrong_sign_is_left_out_however_slowly_it_turns():
     for _ in range(40):
         rig.drive(0.3, 0.05, -0.05, 0.1)
         rig.magnet = -2.0 * rig.pose[2]
-    assert "wrong sign" in rig.fusion.status().doubt
+    assert "check the compass's sign" in rig.fusion.status().doubt
     assert rig.error()[1] < 3 * math.sqrt(rig.estimate.pose_covariance[8])

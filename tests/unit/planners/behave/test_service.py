@@ -229,7 +229,10 @@ def test_a_goal_or_a_path_that_is_followed_excludes_it():
         await bench.clock.sleep(0.2)
         bench.say_tracker(Reason.DRIVING)
         waits = refused(bench)
-        assert (waits.refusal, str(waits)) == (Reason.BUSY, "the path 'bend' is followed as soon as the robot is armed")
+        assert (waits.refusal, str(waits)) == (
+            Reason.BUSY,
+            "the tracker follows the path 'bend' as soon as the robot is armed",
+        )
         bench.mode = GateMode.ARMED
         await bench.clock.sleep(0.2)
         bench.say_tracker(Reason.GOAL_REACHED)

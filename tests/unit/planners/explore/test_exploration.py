@@ -236,7 +236,7 @@ def test_where_a_service_failed_it_ends_where_it_stands_and_saves_the_map(phase:
     stepped.step(failed="goals: a bug")
     assert stepped.actions == (Cancel(), Save())
     run = stepped.saved()
-    assert (run.outcome, run.text) == (Reason.SERVICE_FAILED, "goals: a bug; map in somewhere")
+    assert (run.outcome, run.text) == (Reason.SERVICE_FAILED, "goals: a bug; map saved in somewhere")
 
 
 @pytest.mark.parametrize("reason", [Reason.DISARMED, Reason.BUSY])

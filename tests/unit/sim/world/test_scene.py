@@ -125,7 +125,7 @@ def test_a_robot_of_the_same_name_is_refused():
     config = WorldConfig(map="yard")
     scene = make_scene(config, 1)
     World(config, 1, scene, "same")
-    with pytest.raises(InputError, match="robot same: given twice"):
+    with pytest.raises(InputError, match="robot same: two robots of this name"):
         World(config.model_copy(update={"start": Pose2D(x=2.0, y=0.0, yaw=0.0)}), 1, scene, "same")
 
 

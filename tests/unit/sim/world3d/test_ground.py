@@ -150,7 +150,7 @@ def test_a_sonar_that_leans_looks_over_a_low_thing(tmp_path, solid):
     [
         (
             "<mujoco><worldbody><body><joint/><geom size='1'/></body></worldbody></mujoco>",
-            "<joint>: expected geometries",
+            "<joint>: expected static geometries",
         ),
         ("<robot/>", "expected <mujoco>, found <robot>"),
         ("<mujoco>", "no element found"),

@@ -179,7 +179,7 @@ def test_no_more_is_put_into_it_than_there_is_room_for(solid):
     driver = solid()
     for i in range(24):
         driver.world.add(driver.now, Disc(3.0, 0.1 * i, 0.02))
-    with pytest.raises(InputError, match="24 of kind disc are in the world"):
+    with pytest.raises(InputError, match="maximum of 24 of kind disc"):
         driver.world.add(driver.now, Disc(3.0, -1.0, 0.02))
 
 

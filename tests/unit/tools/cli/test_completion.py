@@ -15,7 +15,7 @@ def test_names_of_topics_devices_and_roles():
     assert ("sensor/scan", "Lidar revolution") in list(complete_topic("sensor/s"))
     assert all(name.startswith("sensor/s") for name, _ in complete_topic("sensor/s"))
     assert list(complete_device("hok")) == [("hokuyo_urg", "lidar"), ("hokuyo_lx", "lidar")]
-    assert list(complete_device("lid")) == [("lidar", "hokuyo_urg")]
+    assert list(complete_device("lid")) == [("lidar", "hokuyo_urg"), ("lidar_2", "hokuyo_urg")]
     assert complete_role("drive") == ["drive", "drive_2", "drive_3", "drive_4"]
 
 

@@ -52,7 +52,7 @@ def test_a_key_chooses_what_is_shown(monkeypatch: pytest.MonkeyPatch, capsys: py
     assert shown["config"] == {"geometry": {"track": 0.26}}
     assert list(shown["origins"]) == ["geometry.track"]
     assert run(monkeypatch, "config", "show", robot, "--key", "geometry.tra") == 4
-    assert "nothing at geometry.tra; sections: version, robot, body, geometry" in capsys.readouterr().err
+    assert "no settings at geometry.tra; sections: version, robot, body, geometry" in capsys.readouterr().err
 
 
 def test_the_first_name_of_config_show_still_works(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
@@ -99,19 +99,19 @@ devices:
         (
             TRUCK + "geometry: {wheelbase: 32 cm}\n",
             "bad.yaml:5: geometry.wheelbase: ",
-            "Metres between front and rear",
+            "Distance between front and rear",
         ),
         (
             TRUCK + "geometry: {wheelbase: 32}\n",
             "bad.yaml:5: geometry.wheelbase: ",
-            "Metres between front and rear",
+            "Distance between front and rear",
         ),
         (TRUCK + "path: {file: nowhere.csv}\n", "bad.yaml:5: path.file: no such file: ", "nowhere.csv"),
         ("include: gone.yaml\n" + TRUCK, "bad.yaml:1: include: no such file: ", "gone.yaml"),
         (
             TRUCK.replace("/dev/b", "/dev/a"),
             "bad.yaml:2: devices: lidar and compass have the same port /dev/a",
-            "its own",
+            "a port for each",
         ),
         (TRUCK + "geometry: {length: 0.3}\n", "bad.yaml:5: geometry: impossible geometry", "less than the wheelbase"),
         (TRUCK + "geometry: {width: 0.2}\n", "bad.yaml:5: geometry: impossible geometry", "less than the track"),

@@ -55,7 +55,7 @@ def test_a_lidar_that_is_not_mounted_as_given_is_reported(log: Path, tmp_path: P
     assert abs(json.loads(right.stdout)["lidar_yaw_off"]) < np.radians(1)
     wrong = CliRunner().invoke(app, ["map", "build", *map(str, arguments), "--mount", "0", "0", "5"])
     assert np.degrees(json.loads(wrong.stdout)["lidar_yaw_off"]) == pytest.approx(-5, abs=1)
-    assert "the lidar is rotated by -" in wrong.stderr
+    assert "the lidar is turned by -" in wrong.stderr
 
 
 def arrays_of(log: Path) -> dict[str, np.ndarray]:

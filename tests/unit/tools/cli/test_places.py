@@ -42,7 +42,7 @@ def reached(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
         found.append((robot, endpoint))
         raise InputError("reached")
 
-    for module in ("orders", "goto", "explore", "settings"):
+    for module in ("orders", "goto", "settings"):
         monkeypatch.setattr(f"monstertruckd.tools.cli.{module}.with_robot", stop)
     return found
 

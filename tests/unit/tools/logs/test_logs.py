@@ -178,7 +178,7 @@ def test_a_sound_log_is_left_as_it_is(tmp_path):
 def test_recovery_takes_no_other_files_place(cut, tmp_path):
     precious = tmp_path / "precious.txt"
     precious.write_text("notes")
-    with pytest.raises(InputError, match=r"precious\.txt: exists already"):
+    with pytest.raises(InputError, match=r"precious\.txt: already exists"):
         recover(cut, precious)
     assert precious.read_text() == "notes"
 

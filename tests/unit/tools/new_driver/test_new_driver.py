@@ -83,7 +83,7 @@ def test_nothing_is_overwritten_and_odd_names_are_refused(tmp_path: Path):
     with pytest.raises(InputError, match="exists; choose another name"):
         write_driver(DriverKind.MOTORS, "acme", tmp_path)
     for name in ("Acme", "../acme", "5x", "a__b", ""):
-        with pytest.raises(InputError, match="expected a name of lower-case letters"):
+        with pytest.raises(InputError, match="expected a name of small letters"):
             write_driver(DriverKind.LIDAR, name, tmp_path)
     for name in ("ld19", "lidar"):
         with pytest.raises(InputError, match=f"has this name; expected another, such as acme_{name}"):
