@@ -273,7 +273,7 @@ def _drive(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
         if observed.unseen:
             if not run.via and observed.pose is not None and _error(observed.pose, run.goal, config) <= 1.0:
                 return _arrived(replace(run, misses=MISSES), observed, config)
-            reason, text = Reason.UNSEEN_STOP, "the route reverses onto ground that no sensor has seen"
+            reason, text = Reason.UNSEEN_STOP, "the route leads onto ground that no sensor has seen"
         run = replace(run, blocks=run.blocks + 1, blocked_scans=0)
         if run.blocks > BLOCKS:
             return _recover(run, reason, text, config)

@@ -227,7 +227,7 @@ class TrackingStep:
             text = (
                 ""
                 if reached
-                else f"path {path.name!r} reverses onto ground that no sensor has seen, from {at[0]:.2f}, {at[1]:.2f}"
+                else f"path {path.name!r} leads onto ground that no sensor has seen, from {at[0]:.2f}, {at[1]:.2f}"
             )
         if command.outcome is Reason.PATH_LOST:
             text = self._lost(path, command.progress, at)

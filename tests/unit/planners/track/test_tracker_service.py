@@ -467,7 +467,7 @@ def driven(
     return outputs, step
 
 
-def test_a_path_that_leads_back_onto_unseen_ground_ends_within_seconds_and_says_where():
+def test_a_path_that_leads_onto_unseen_ground_ends_within_seconds_and_says_where():
     outputs, _ = driven(0.0, 0.0, 3.0, again=True, reasons=(Reason.UNSEEN_STOP,))
     outcomes = [output.command.outcome for output in outputs]
     first = outcomes.index(Reason.UNSEEN_STOP)
@@ -475,7 +475,7 @@ def test_a_path_that_leads_back_onto_unseen_ground_ends_within_seconds_and_says_
     assert set(outcomes[first:-1]) == {Reason.UNSEEN_STOP}
     assert all(output.command.speed == 0.0 and not output.drive for output in outputs[first:-1])
     (event,) = [event for output in outputs for event in output.events if event.reason is Reason.UNSEEN_STOP]
-    assert "no sensor has seen, from 0.00, 0.00" in event.text
+    assert "leads onto ground that no sensor has seen, from 0.00, 0.00" in event.text
     assert outcomes[-1] is Reason.DRIVING, "armed again it tries again"
 
 
