@@ -67,7 +67,7 @@ class ScaleWatch:
             self._sound, self._scale = (Cloud.of(earlier.scan), np.zeros(3)), 1.0
         cloud, moved = self._sound
         moved = compose(moved, motions[-1])
-        # 0.5: maximum distance at which it still shows the same surroundings, m
+        # 0.5: maximum distance over which it sees the same surroundings, m
         self._sound = None if math.hypot(moved[0], moved[1]) > 0.5 else (cloud, moved)
         if np.count_nonzero(~_fits(latest.scan, cloud, moved)) < REFUTING:
             self._sound = None
@@ -121,7 +121,7 @@ def _fits(scan: Scan, cloud: Cloud, motion: Array) -> np.ndarray[tuple[int], np.
 
 
 def _factor(latest: Revolution, earlier: Revolution, motions: list[Array]) -> float | None:
-    """Compare points of equal bearing, under the motion for which they agree best on one factor.
+    """Compare points of equal bearing, under the motion that gives the best agreement on one factor.
 
     Return None for too few compared points, or if the factor is within their scatter: the lidar then sees another
     place.
@@ -144,7 +144,7 @@ def _polar(points: Array, origin: tuple[float, float]) -> tuple[Array, Array]:
 
 
 def _ratios(bearings: Array, distances: Array, others: Array, reach: Array) -> Array:
-    """Return the logarithms of the ratios of the points' distances to those of the nearest bearings."""
+    """Return the log ratios of the points' distances to the distances of their neighbours by bearing."""
     order = np.argsort(others)
     there = np.searchsorted(others[order], bearings)
     sides = [order[(there + side) % len(order)] for side in (-1, 0)]

@@ -1,9 +1,9 @@
-"""Estimate of the lidar's mount beside the map: motions of the wheels against those of the scans.
+"""Estimate of the lidar's mount from the map: compares motions by the wheels with motions by the scans.
 
-Wheels measure motion in the robot's axes, scans in the lidar's. If the lidar is rotated against its configured mount,
-every motion by the scans is rotated the other way, while the map stays consistent; if it hangs upside down, every turn
-is reversed. With the lidar's pose X in its configured mount, A X = X B for motions A of the wheels and B of the scans
-(Tsai and Lenz 1989): linear in its yaw, in the scale of the wheels, and in its displacement.
+Wheels measure motion in the robot's axes, scans in the axes of the lidar. If the lidar is rotated against its
+configured mount, every motion by the scans is rotated the other way, while the map stays consistent; if it hangs upside
+down, every turn is reversed. With the lidar's pose X in its configured mount, A X = X B for motions A of the wheels and
+B of the scans (Tsai and Lenz 1989): linear in its yaw, in the scale of the wheels, and in its displacement.
 """
 
 import math

@@ -1,1 +1,1 @@
-"""Goals: from a requested pose to the truck at rest there, or to the reason why not."""
+"""Goals: drive from the current pose to rest at a requested pose, or report the reason for failure."""

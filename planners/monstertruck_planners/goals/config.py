@@ -64,15 +64,15 @@ class LocalConfig(Schema):
     rejoin_distance: Positive = 0.06
     """Maximum distance from the route for returning to it (m), with 0.3 m per radian of heading error."""
     people: PeopleConfig | None = PeopleConfig()
-    """People who walk; null: they are obstacles where they are"""
+    """Walking people; null: they are obstacles at their current places"""
     blocked_timeout: Positive = 2.0
-    """Time without a path round an obstacle until the route is blocked (s)."""
+    """Maximum time without a path around an obstacle (s); then the route is blocked."""
     detour: Positive = 45.0
-    """Time of deformation without progress along the route until the route is blocked (s)."""
+    """Maximum time of deformation without progress along the route (s); then the route is blocked."""
     latency: Positive = 0.05
     """Latency of a deformation on the virtual clock (s)"""
     deadline: Positive = 5.0
-    """Timeout of a silent worker (s), which is then killed"""
+    """Maximum silence of the worker before it is killed (s)"""
 
 
 class PlannerConfig(Schema):
@@ -108,9 +108,9 @@ class PlannerConfig(Schema):
     timeout: Positive = 600.0
     """Time limit of a goal (s), without the time unarmed or paused."""
     unarmed_timeout: Positive = 300.0
-    """Timeout of waiting for the truck to be armed, or for a fresh pose (s)."""
+    """Maximum wait for the truck to be armed, or for a fresh pose (s)."""
     stuck: Positive = 4.0
-    """Time without progress until the recovery behaviours begin (s)."""
+    """Maximum time without progress before the recovery behaviours begin (s)."""
     progress: Positive = 0.03
     """Minimum progress along the path (m)."""
     look_ahead: Positive = 1.5
@@ -126,7 +126,7 @@ class PlannerConfig(Schema):
     routes: Annotated[int, Field(ge=1)] = 30
     """Maximum number of routes for one goal."""
     max_tilt: Annotated[float, Field(gt=0, le=1.5)] = 0.1
-    """Maximum tilt of a used scan (rad); beyond, it passes over obstacles or hits the ground"""
+    """Maximum tilt of a used scan (rad); a scan beyond it passes over obstacles or hits the ground"""
     scan_tolerance: NotNegative = 0.08
     """Maximum distance of a return from the map obstacle that explains it (m); two standard deviations of the position
     are added, up to twice this value in total"""
@@ -134,7 +134,7 @@ class PlannerConfig(Schema):
     latency: Positive = 0.5
     """Latency of a route on the virtual clock (s)"""
     deadline: Positive = 30.0
-    """Timeout of a silent worker (s), which is then killed"""
+    """Maximum silence of the worker before it is killed (s)"""
 
     @model_validator(mode="after")
     def _in_time(self) -> Self:

@@ -183,7 +183,7 @@ class DeformStep:
         """Rest of the route from the start of its deformation; None while the route is free."""
         self._people: PeopleTracker | None = None
         self._yielding: int | None = None
-        """Stamp of the first scan since which the robot would approach people (ns)."""
+        """Stamp of the first scan of a continuous approach to people (ns)."""
 
     def step(self, task: DeformTask) -> DeformAnswer:
         """Process a scan and return the result for the route.
@@ -276,7 +276,7 @@ class DeformStep:
     def _walkers(
         self, setup: Setup, task: DeformTask, points: Array, mapped: NDArray[np.bool_]
     ) -> tuple[tuple[Walker, ...], NDArray[np.bool_]]:
-        """Return the people who walk, and the points in base of those who are no obstacles where they are."""
+        """Return the walking people, and the points in base of those exempt from the obstacles."""
         none = np.zeros(len(points), np.bool_)
         if self._people is None:
             return (), none
@@ -291,7 +291,7 @@ class DeformStep:
         return since is None or (people is not None and task.scan.stamp - since <= people.patience * SECOND)
 
     def _yields(self, setup: Setup, task: DeformTask, here: Array, walkers: tuple[Walker, ...]) -> bool:
-        """Whether the robot stands to let people pass whom it would approach."""
+        """Whether the robot stops to let people pass instead of approaching them."""
         people = setup.config.local.people
         if people is None or not walkers:
             self._yielding = None
@@ -358,7 +358,7 @@ class DeformStep:
     def _field(
         self, setup: Setup, pose: Pose2, zones: ZoneLayer, margin: float, walkers: tuple[Walker, ...]
     ) -> DistanceField:
-        """Return the distance field of the window, the map's obstacles, the zones and where people will be."""
+        """Return the distance field of window, map obstacles, zones and predicted places of people."""
         window = self._window
         closed = np.zeros(window.cells.shape, np.bool_)
         if zones.shapes:
@@ -367,7 +367,7 @@ class DeformStep:
         people = setup.config.local.people
         if people is not None:
             for walker in walkers:
-                # Paths lead behind a person: the ground ahead of him is closed as far as he walks in that time.
+                # Paths lead behind a person: the ground ahead is closed over the predicted distance.
                 places = walker.at(np.linspace(0.0, people.horizon, 9))
                 closed |= window.discs(places, walker.radius + setup.config.local.clearance, setup.footprint, pose)
         return window.field(self._walls, closed)

@@ -145,7 +145,7 @@ class DeformTask:
 
 
 Finding = Literal["idle", "free", "kept", "new", "blocked", "yields"]
-"""No route yet; route free; deformed path kept; new deformed path; no path found; the robot lets a person pass."""
+"""State of the route: none yet; free; deformed path kept; new deformed path; no path found; letting a person pass."""
 
 
 @dataclass(frozen=True, slots=True)

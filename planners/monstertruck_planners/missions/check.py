@@ -33,60 +33,60 @@ Key = tuple[str | int, ...]
 
 @dataclass(frozen=True, slots=True)
 class Mistake:
-    """A mistake in a mission."""
+    """An error in a mission."""
 
     key: Key
-    """Keys and indices that lead to it in the file."""
+    """Keys and indices of its location in the file."""
     number: str
     """Position of the step."""
     text: str
     lacks: bool = False
-    """Whether the robot lacks something, and the mission is right as such."""
+    """Whether the robot lacks a part, while the mission itself is correct."""
 
 
 @dataclass(frozen=True, slots=True)
 class Abilities:
-    """Parts of the robot that steps and conditions need."""
+    """Parts of the robot required by steps and conditions."""
 
     explorer: bool = True
     points: bool = True
     charge: bool = True
-    """Whether it estimates the charge of its battery."""
+    """Whether the robot estimates its battery charge."""
     lidar: bool = True
     zones: bool = True
     behaviour: Callable[[str, Mapping[str, float | str | bool]], object] | None = lambda _name, _settings: None
-    """Raises a ``TruckError`` if there is no such behaviour or it refuses the settings; None: no behaviours."""
+    """Check of a behaviour: raises a ``TruckError`` if it is unknown or its settings are invalid; None without any."""
     docks: Docks | None = None
-    """Docks by name; None if they are not known"""
+    """Docks by name; None if unknown"""
     known: frozenset[str] | None = None
-    """Names of the points of interest, if all of them are known."""
+    """Names of the points of interest; None unless all are known."""
 
 
 class Ends(NamedTuple):
-    """Possible ends of a step."""
+    """Possible outcomes of a step."""
 
     good: bool
     """Whether it can succeed."""
     bad: bool
     """Whether it can fail."""
     takes_time: bool
-    """Whether it takes time whatever its end."""
+    """Whether it takes time whatever its outcome."""
 
 
 class StepPlace(NamedTuple):
-    """A step and its place in the mission."""
+    """A step and its position in the mission."""
 
     key: Key
     number: str
     step: AnyStep
 
     def mistake(self, text: str, *more: str | int, lacks: bool = False) -> Mistake:
-        """Return a mistake of this step, at a key in it if given."""
+        """Return an error in this step, at one of its keys if given."""
         return Mistake((*self.key, *more), self.number, text, lacks)
 
 
 def steps_of(mission: Mission) -> Iterator[StepPlace]:
-    """Return all steps, those within others after them."""
+    """Return all steps, nested steps after their containing steps."""
     return _steps(mission, (), "")
 
 
@@ -109,7 +109,7 @@ def _blocks(node: Container, key: Key, before: str) -> list[list[StepPlace]]:
 
 
 def dead_ends(mission: Mission) -> list[Mistake]:
-    """Return the steps that cannot be reached, and loops that never end or take no time."""
+    """Return the unreachable steps, and the loops that never end or take no time."""
     found: list[Mistake] = []
     (places,) = _blocks(mission, (), "")
     _sequence(places, mission.on_failure, found)
@@ -117,7 +117,7 @@ def dead_ends(mission: Mission) -> list[Mistake]:
 
 
 def _sequence(places: list[StepPlace], policy: str, found: list[Mistake]) -> Ends:
-    """Return the ends of steps in sequence, and note their mistakes."""
+    """Return the outcomes of steps in sequence, and record their errors."""
     bad, takes_time, before = False, False, None
     for place in places:
         if before is not None:
@@ -142,7 +142,7 @@ def _fallback(places: list[StepPlace], found: list[Mistake]) -> Ends:
 
 
 def _ends(place: StepPlace, policy: str, found: list[Mistake]) -> Ends:
-    """Return the ends of a step as those around it see them: after retries, its limit and its policy."""
+    """Return the outcomes of a step for its containing steps: after retries, its limit and its policy."""
     good, bad, takes_time = _own_ends(place, found)
     policy = place.step.on_failure or policy
     bad = bad or (place.step.limit is not None and takes_time)

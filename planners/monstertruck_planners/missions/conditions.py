@@ -1,4 +1,4 @@
-"""Conditions of missions: what they need to know of the robot, and whether they hold."""
+"""Conditions of missions: the facts about the robot that they require, and their evaluation."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -8,7 +8,7 @@ from monstertruck_schemas.mission import Condition
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """What conditions are about."""
+    """Facts that conditions refer to."""
 
     charge: float | None = None
     """Charge of the battery (%); None if unknown."""
@@ -21,13 +21,13 @@ class Facts:
     obstacle: float = 0.0
     """Time for which an obstacle has stopped the robot (s)."""
     zones: frozenset[str] = frozenset()
-    """Names of the zones that the footprint reaches into."""
+    """Names of the zones overlapped by the footprint."""
     minute: int | None = None
     """Local time of day (minutes since midnight); None if unknown."""
 
 
 UNKNOWN: Final = Facts()
-"""Facts about a robot that knows nothing."""
+"""Facts about a robot without any information."""
 
 
 def holds(condition: Condition, facts: Facts) -> bool:
@@ -48,7 +48,7 @@ def holds(condition: Condition, facts: Facts) -> bool:
 
 
 def _within(interval: str, minute: int) -> bool:
-    """Return whether a minute of the day lies in an interval as 22:00-06:30; its end does not belong to it."""
+    """Return whether a minute of the day lies in an interval such as 22:00-06:30, its end excluded."""
     begin, end = (60 * int(at[:2]) + int(at[3:]) for at in interval.split("-"))
     return begin <= minute < end if begin <= end else not end <= minute < begin
 

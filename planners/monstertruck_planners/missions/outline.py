@@ -81,7 +81,7 @@ def _leaf_in_words(step: AnyStep) -> str:
 
 
 def lines(mission: Mission) -> tuple[MissionLine, ...]:
-    """Return all steps in order, those within others below them; a watch and an otherwise have a separate line."""
+    """Return all steps in order, nested steps below their containing step; watches and otherwise get separate lines."""
     return tuple(_lines(mission, "", 0))
 
 
@@ -104,7 +104,7 @@ def _lines(node: Container, before: str, depth: int) -> Iterator[MissionLine]:
 def shown(all_lines: tuple[MissionLine, ...], number: str) -> tuple[MissionLine, ...]:
     """Return the lines around the current step, marked where they contain it."""
     at = next((index for index, line in enumerate(all_lines) if line.number == number), 0)
-    # 8: lines before and after the current one, so a report stays small
+    # 8: number of lines before and after the current one, which keeps a report small
     return tuple(
         line.model_copy(update={"active": f"{number}.".startswith(f"{line.number}.")})
         for line in all_lines[max(0, at - 8) : at + 9]
@@ -112,7 +112,7 @@ def shown(all_lines: tuple[MissionLine, ...], number: str) -> tuple[MissionLine,
 
 
 def prefix(node: Mission | AnyStep, block: int) -> str:
-    """Return what precedes the index of a step in its position: the block of a branch or a parallel step."""
+    """Return the part of a position before the index: the block of a branch or a parallel step."""
     if block == 0:
         return ""
     return "otherwise." if isinstance(node, BranchStep) else f"watch{block}."

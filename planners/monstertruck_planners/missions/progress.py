@@ -64,7 +64,7 @@ class MissionFrame(Schema):
     """Position in the mission or in a step that contains others; stored for a resume."""
 
     block: Annotated[int, Field(ge=0)] = 0
-    """Index among the node's ``blocks``: of a branch 1 = otherwise, of a parallel step n = its watch n"""
+    """Index among the node's ``blocks``: for a branch 1 = otherwise, for a parallel step n = watch n"""
     index: Annotated[int, Field(ge=0)] = 0
     """Index of the current step in the block"""
     attempt: Annotated[int, Field(ge=0)] = 0
@@ -72,11 +72,11 @@ class MissionFrame(Schema):
     rounds: Annotated[int, Field(ge=0)] = 0
     """Completed rounds of a repeat"""
     fired: Annotated[tuple[int, ...], Field(strict=False)] = ()
-    """Watches (blocks) whose condition has held ever since they fired"""
+    """Watches (blocks) whose condition has held since they fired"""
     interrupted: Annotated[tuple["MissionFrame", ...], Field(strict=False)] = ()
     """Position of a parallel step when a watch interrupted it: its frame and its inner frames"""
     spent: Annotated[float, Field(ge=0)] = 0.0
-    """Seconds spent in it, excluding pauses"""
+    """Seconds spent in the step, excluding pauses"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +106,7 @@ class MissionProgress:
 
     @property
     def step(self) -> AnyStep:
-        """Current step: one that contains others only before ``enter``, or if it has nothing to do."""
+        """Current step; a step that contains others only before ``enter``, or if it has no work."""
         *_, node = _nodes(self.mission, self.stack)
         assert not isinstance(node, Mission)
         return node
@@ -124,7 +124,7 @@ class MissionProgress:
 
 
 def enter(progress: MissionProgress, facts: Facts) -> MissionProgress:
-    """Descend to the first step that contains no others, or to a branch that has nothing to do."""
+    """Descend to the first step without nested steps, or to a branch without work."""
     while isinstance(step := progress.step, Container):
         frame = MissionFrame(block=int(not holds(step.when, facts))) if isinstance(step, BranchStep) else MissionFrame()
         if not _block(step, frame):
@@ -185,7 +185,7 @@ def after(
 def _onward(
     node: Container, frame: MissionFrame, end: StepEnd, facts: Facts
 ) -> tuple[tuple[MissionFrame, ...], StepEnd, Next | None]:
-    """Continue within a node after one of its steps; without frames, the node has ended as returned."""
+    """Continue within a node after one of its steps; without frames left, the node has ended as returned."""
     following = (frame.model_copy(update={"index": frame.index + 1, "attempt": 0}),)
     more = frame.index + 1 < len(_block(node, frame))
     if isinstance(node, FallbackStep):
@@ -236,7 +236,7 @@ def passed(progress: MissionProgress, seconds: float) -> MissionProgress:
 
 
 def expired(progress: MissionProgress) -> tuple[int, float] | None:
-    """Return the depth and the limit (s) of the outermost step whose time is over."""
+    """Return the depth and the limit (s) of the outermost step that exceeds its limit."""
     if progress.returning:
         return None
     for depth, node in enumerate(_nodes(progress.mission, progress.stack)[: len(progress.stack)]):

@@ -1,4 +1,4 @@
-"""Mission service: does the steps of a mission through the goal, behaviour and exploration services."""
+"""Mission service: executes the steps of a mission through the goal, behaviour and exploration services."""
 
 import asyncio
 import contextlib
@@ -106,12 +106,12 @@ DrivingStep = (
     | UndockStep
     | ReturnStep
 )
-"""Steps that other services do."""
+"""Steps executed by other services."""
 
 SOURCE: Final = ServiceName.MISSIONS.value
-"""Source of the goals, behaviours and explorations of a mission."""
+"""Source of a mission's goals, behaviours and explorations."""
 OWN: Final = frozenset({SOURCE, ServiceName.EXPLORER.value})
-"""Sources of goals that belong to a mission or to an exploration."""
+"""Sources of goals sent by a mission or an exploration."""
 MISSION_CHECK_RATE: Final = 5.0
 """Checks per second."""
 CHANGES: Final = ("number", "running", "node", "attempt", "outcome", "resumable")
@@ -138,16 +138,16 @@ class MissionInputs:
     points: Subscription[PointsOfInterest] | None = None
     slam: Subscription[SlamHealth] | None = None
     battery: Subscription[Battery] | None = None
-    """None if the robot does not estimate its charge."""
+    """Battery charge; None if the robot does not estimate it."""
     lidar: bool = False
     """Whether a lidar sees obstacles."""
     zones: Subscription[Zones] | None = None
-    """None if the robot keeps no zones."""
+    """Zones; None if the robot has none."""
 
 
 @dataclass(frozen=True, slots=True)
 class MissionParts:
-    """Services that do the steps."""
+    """Services that execute the steps."""
 
     goals: GoalService
     behaviours: BehaviourService | None
@@ -159,7 +159,7 @@ class MissionService:
     """Runs one mission at a time.
 
     Args:
-        parts: services that do the steps.
+        parts: services that execute the steps.
         clock: time source.
         file: stores the progress across restarts; None to store nothing.
         localised: whether the robot localises in a known map, so poses stay valid after a restart.
@@ -214,7 +214,7 @@ class MissionService:
         self._keeping: asyncio.Task[None] | None = None
         """Writes the changes of the latest request."""
         self._blocked: int | None = None
-        """Time since which an obstacle stops the robot (ns)."""
+        """Start of the current stop by an obstacle (ns)."""
         self._known: tuple[PointsOfInterest | None, frozenset[str], int] = (None, frozenset(), 0)
         """Latest points of interest, their names and the number of tags."""
         self._lines: tuple[MissionLine, ...] = ()
@@ -371,7 +371,7 @@ class MissionService:
         following: Next = "step"
         try:
             while following not in ("done", "ended"):
-                if following == "round":  # one that takes no time must not stall the loop
+                if following == "round":  # a mission that takes no time must not stall the loop
                     await self._clock.sleep(1.0 / MISSION_CHECK_RATE)
                 following = await self._do_next(self._progress)
                 if following not in ("done", "ended"):
@@ -415,10 +415,11 @@ class MissionService:
         self.tasks.report()
 
     async def _supervised(self, progress: MissionProgress) -> tuple[StepEnd | None, int | None]:
-        """Run the current step until it ends, a time limit is over or a watch interrupts it.
+        """Run the current step until it ends, exceeds a time limit or is interrupted by a watch.
 
         Returns:
-            The outcome, None after an interruption, and the depth of the step whose limit is over, None for this one.
+            The outcome (None after an interruption), and the depth of the step that exceeded its limit (None for this
+            one).
         """
         step = ReturnStep(do="return") if progress.returning else progress.step
         spent = 0.0
@@ -460,7 +461,7 @@ class MissionService:
                     return StepEnd(Reason.OK)
                 case ConditionStep():
                     return judge(step, self._facts())
-                case BranchStep():  # whose chosen side has no steps
+                case BranchStep():  # the chosen side has no steps
                     return StepEnd(Reason.OK)
                 case SequenceOfSteps() | FallbackStep() | RepeatStep() | ParallelStep():
                     raise AssertionError("entered before")
@@ -596,14 +597,14 @@ class MissionService:
         reports: Subscription[T],
         enough: Callable[[T], StepEnd | None] = lambda _: None,
     ) -> StepEnd:
-        """Have another service do a task, and return how it ended.
+        """Have another service execute a task, and return its outcome.
 
         Args:
             server: task server of that service.
             start: creates the request.
             stop: creates the request that stops the task, sent on cancellation, on timeout, or after ``enough``.
             reports: reports of that service.
-            enough: returns the end of a running task that has done enough, else None.
+            enough: returns the outcome of a running task that is sufficiently complete, else None.
 
         Raises:
             TruckError: the task was refused.
@@ -653,7 +654,7 @@ class MissionService:
 
     @property
     def _paused(self) -> bool:
-        """Whether the current goal is paused, so that no time limit runs."""
+        """Whether the current goal is paused, which stops its time limits."""
         goal = self._in.goal.latest
         return goal is not None and goal.phase is GoalPhase.PAUSED
 
@@ -678,7 +679,7 @@ class MissionService:
         )
 
     def _observe_obstacle(self) -> None:
-        """Note since when an obstacle stops the robot, or makes its goal wait."""
+        """Record the start of a stop by an obstacle, or of a goal's wait for one."""
         gate, goal = self._in.gate.latest, self._in.goal.latest
         blocked = gate is not None and Reason.OBSTACLE_STOP in gate.reasons
         blocked = blocked or (goal is not None and goal.phase is GoalPhase.WAITING)
@@ -770,7 +771,7 @@ class MissionService:
 
 
 def _end_of(state: TaskState | None, number: int, noun: str) -> StepEnd | None:
-    """Return how task ``number`` ended according to the latest report; None while it runs."""
+    """Return the outcome of task ``number`` from the latest report; None while it runs."""
     if state is None or state.number < number:
         return None
     if state.number > number:

@@ -1,1 +1,1 @@
-"""Trackers: from a path and the current pose to speed and axle angles."""
+"""Trackers: compute speed and axle angles from a path and the current pose."""

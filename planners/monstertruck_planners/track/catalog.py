@@ -1,4 +1,4 @@
-"""The path trackers by ``kind``."""
+"""Path trackers by ``kind``."""
 
 from typing import TYPE_CHECKING, Annotated, Any, Final, cast
 
@@ -38,20 +38,20 @@ TRACKERS: Final = Catalog(
     ),
     base=TrackerConfig,
 )
-"""A tracker is made from its settings and the truck's geometry; it is a ``PathTracker``."""
+"""A tracker kind is built from its settings and the truck's geometry, and is a ``PathTracker``."""
 
 AnyTracker = Annotated[TrackerConfig, TRACKERS.section()]
-"""The configuration's section `tracker`."""
+"""Section `tracker` of the configuration."""
 
 
 def build_tracker(config: TrackerConfig, steering: FourWheelSteering) -> "PathTracker[Any]":
-    """The tracker of a configuration.
+    """Build the tracker of a configuration.
 
     Args:
-        config: with its ``kind``.
-        steering: the truck's geometry.
+        config: settings with their ``kind``.
+        steering: steering geometry of the truck.
 
     Raises:
-        InputError: no such kind, or what it needs is not installed.
+        InputError: the kind does not exist, or a required package is not installed.
     """
     return cast("PathTracker[Any]", TRACKERS.build(config, config, steering))

@@ -1,6 +1,6 @@
 """Tracker settings: a shared base and one model per ``kind``.
 
-Light on purpose: reading a configuration loads no tracker. ``catalog`` maps each kind to its class.
+Light on purpose: loading a configuration imports no tracker. ``catalog`` maps each kind to its class.
 """
 
 import math
@@ -25,55 +25,58 @@ class TrackerConfig(Schema):
     """Settings shared by all trackers."""
 
     rate: Annotated[float, Field(gt=0, le=100)] = 20.0
-    """Requests per second."""
+    """Rate of requests (1/s)."""
     lease: Annotated[float, Field(gt=0, le=2)] = 0.25
-    """Lease of each request, s."""
+    """Lease of each request (s)."""
     steering: Steering = "counter"
-    """Steered axles if the path specifies none: one alone; both by opposite or (keeping the heading) equal angles; or
-    hybrid, opposite for the curve and equal for the lateral error"""
+    """Steered axles if the path specifies none: one alone; both with opposite or (keeping the heading) equal angles; or
+    hybrid, opposite for the curve and equal for the lateral error
+    """
     angle: Annotated[float, Field(gt=0, lt=1)] = 0.362
-    """Maximum axle angle, rad: with both axles opposite a circle of 0.42 m; smaller if the servos reach less."""
+    """Maximum axle angle (rad), also limited by the servos; with both axles opposite it gives a circle of 0.42 m."""
     speed: Positive = 0.18
-    """Forward speed, m/s."""
+    """Forward speed (m/s)."""
     reverse_speed: Positive = 0.12
-    """Reverse speed, m/s."""
+    """Reverse speed (m/s)."""
     min_speed: Positive = 0.03
-    """Minimum speed before a stop, m/s."""
+    """Minimum speed before a stop (m/s)."""
     acceleration: Positive = 0.3
-    """Assumed acceleration of the truck, m/s^2."""
+    """Assumed acceleration of the truck (m/s^2)."""
     deceleration: Positive = 0.1
-    """Deceleration before curves, changes of direction and the end of the path, m/s^2."""
+    """Deceleration before curves, changes of direction and the end of the path (m/s^2)."""
     lateral_acceleration: Positive = 0.5
-    """Maximum speed squared times curvature, m/s^2."""
+    """Maximum lateral acceleration: speed squared times curvature (m/s^2)."""
     goal_tolerance: Positive = 0.02
-    """Maximum distance of a stopped truck from the end of a completed path, m."""
+    """Maximum distance of a stopped truck from the end of a completed path (m)."""
     goal_yaw_tolerance: Annotated[float, Field(gt=0, le=math.pi)] = 0.2
-    """Maximum heading error at the end of a completed path, rad."""
+    """Maximum heading error at the end of a completed path (rad)."""
     lost_distance: Positive = 0.5
-    """Distance from the path beyond which the tracker gives up, m."""
+    """Maximum distance from the path (m); beyond it the tracker gives up."""
     path_tolerance: Positive = 0.15
-    """Accepted deviation of the best drive from a path that an operator sends or configures, m: paths that the robot
-    can only drive with larger deviations are refused."""
+    """Maximum deviation of the best drive from a path that an operator sends or configures (m); paths that force the
+    robot further away are refused.
+    """
     slow_clearance: Positive = 0.12
-    """Clearance along the next metres below which the tracker reduces the speed in proportion, m."""
+    """Clearance along the next metres below which the tracker reduces the speed in proportion (m)."""
     slow_tilt: Annotated[float, Field(gt=0, lt=math.pi / 4)] = 0.1
-    """Tilt above which the tracker reduces the speed, down to ``min_speed`` at twice this tilt, rad."""
+    """Tilt above which the tracker reduces the speed, down to ``min_speed`` at twice this tilt (rad)."""
     slow_roughness: Annotated[float, Field(gt=0, lt=math.pi / 4)] = 0.05
-    """Standard deviation of the tilt over the last seconds above which the speed falls in the same manner, rad."""
+    """Standard deviation of the tilt over the last seconds above which the tracker reduces the speed likewise (rad)."""
     dead_time: Annotated[float, Field(ge=0, le=1)] | None = None
-    """Time from a request to the first movement of the wheels, s; null: the servos' configured value, else estimated
-    while driving. If the truck's motion contradicts a value, the estimate replaces it, with an event"""
+    """Time from a request to the first movement of the wheels (s); null: the configured value of the servos, else an
+    estimate made while driving. If the truck's motion contradicts a value, the estimate replaces it, with an event
+    """
     lag: Annotated[float, Field(ge=0, le=1)] | None = None
-    """Time constant of the axles after the dead time, s; null: as for ``dead_time``"""
+    """Time constant of the axles after the dead time (s); null: as for ``dead_time``"""
     steering_rate: Positive = 1.0
-    """Maximum turning rate of the axles, rad/s."""
+    """Maximum turning rate of the axles (rad/s)."""
 
     steering_distance: Positive = 0.05
-    """Distance for the axles to reach the path's steering angles at the chosen speed, m."""
+    """Distance in which the axles must reach the path's steering angles at the chosen speed (m)."""
 
     @property
     def reach(self) -> float:
-        """How far ahead of its last position on the path the truck is searched for (m)."""
+        """Search range ahead of the truck's last position on the path (m)."""
         return 0.4
 
     @property
@@ -97,11 +100,11 @@ class PurePursuitConfig(TrackerConfig):
 
     kind: Literal["pure_pursuit"] = "pure_pursuit"
     lookahead: Positive = 0.4
-    """Distance along the path to the target point, m; the maximum if it depends on the speed."""
+    """Distance along the path to the target point (m); the maximum if it depends on the speed."""
     min_lookahead: Positive = 0.2
-    """Minimum look-ahead distance, m."""
+    """Minimum look-ahead distance (m)."""
     lookahead_time: Annotated[float, Field(ge=0, le=5)] = 0.0
-    """Look-ahead time, s; 0: always ``lookahead``."""
+    """Look-ahead time (s); 0 for the fixed distance ``lookahead``."""
 
     @property
     def reach(self) -> float:
@@ -110,17 +113,17 @@ class PurePursuitConfig(TrackerConfig):
 
 
 class FuzzyConfig(TrackerConfig):
-    """Fuzzy controller of rsband_local_planner: its rules as published, or with their mistakes corrected."""
+    """Fuzzy controller of rsband_local_planner, with its rules as published or corrected."""
 
     kind: Literal["fuzzy"]
     rules: Literal["published", "corrected"] = "corrected"
-    """Rules as published, or with their mistakes corrected."""
+    """Use the rules as published, or with their errors corrected."""
     sub_goal: Positive = 0.6
-    """Distance along the path to the target pose, m."""
+    """Distance along the path to the target pose (m)."""
     near: Positive = 0.2
-    """Maximum distance of a close sub-goal, m; at twice this distance it is far."""
+    """Maximum distance of a close sub-goal (m); at twice this distance it is far."""
     lateral_tolerance: Positive = 0.05
-    """Lateral deviation classified as small, m."""
+    """Lateral deviation classified as small (m)."""
 
     @property
     def reach(self) -> float:
@@ -133,13 +136,13 @@ class LqrConfig(TrackerConfig):
 
     kind: Literal["lqr"]
     preview: Annotated[float, Field(gt=0, le=5)] = 1.5
-    """Preview time, s."""
+    """Preview time (s)."""
     lateral_scale: Positive = 0.01
-    """Distance from the path that weighs 1, m."""
+    """Distance from the path with a weight of 1 (m)."""
     heading_scale: Positive = 0.2
-    """Heading error that weighs 1, rad."""
+    """Heading error with a weight of 1 (rad)."""
     rate_scale: Positive = 2.0
-    """Steering rate that weighs 1, rad/s."""
+    """Steering rate with a weight of 1 (rad/s)."""
 
     @property
     def beyond(self) -> float:
@@ -148,7 +151,7 @@ class LqrConfig(TrackerConfig):
 
 
 class MpcConfig(LqrConfig):
-    """Model-predictive control: the same costs, with the limits of angles and rates, re-linearised at each step."""
+    """Model-predictive control: the same costs, with limits of angles and rates, re-linearised at each step."""
 
     kind: Literal["mpc"]  # type: ignore[assignment]
     iterations: Annotated[int, Field(ge=10, le=2000)] = 200

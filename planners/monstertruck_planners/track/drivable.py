@@ -1,8 +1,8 @@
-"""Whether a body can drive a drawn path: the least deviation of a drive with bounded curvature, in metres.
+"""Check whether a body can drive a drawn path: minimum deviation of a drive with bounded curvature (m).
 
-An angle at a vertex does not decide: a tracker rounds the corners of a coarse polyline. Where the heading of a path
-changes faster than the body turns, an ideal body chases points ahead of it; the smallest deviation among several
-look-ahead distances counts.
+The angle at a vertex is not decisive, because a tracker rounds the corners of a coarse polyline. Where the heading of a
+path changes faster than the body turns, an ideal body follows points ahead of it with several look-ahead distances; the
+smallest deviation is used.
 """
 
 import math
@@ -28,16 +28,16 @@ STEPS: Final = 20
 
 
 class Bend(NamedTuple):
-    """Part of a run that turns faster than the body."""
+    """Part of a run with a faster turn than the body can make."""
 
     first: int
-    """Index of the last pose before it."""
+    """Index of the last pose before the bend."""
     last: int
-    """Index of the first pose after it."""
+    """Index of the first pose after the bend."""
     turn: float
     """Change of the heading (rad), positive to the left."""
     length: float
-    """Distance travelled meanwhile (m)."""
+    """Distance travelled in the bend (m)."""
     deviation: float
     """Minimum deviation of the body from the path (m); +inf if it does not return to the path."""
 
@@ -47,11 +47,11 @@ def require_drivable(path: Path, config: TrackerConfig, geometry: FourWheelSteer
 
     Args:
         path: see ``check_path``.
-        config: tolerance, axle angle and way of steering of the tracker.
+        config: tolerance, axle angle and steering mode of the tracker.
         geometry: geometry of the body.
 
     Raises:
-        InputError: names the first such place, the demand of the path there and the limit of the body.
+        InputError: names the first such place, its turning radius and the limit of the body.
     """
     tolerance = config.path_tolerance
     jump = _jump(path, tolerance)
@@ -74,7 +74,7 @@ def require_drivable(path: Path, config: TrackerConfig, geometry: FourWheelSteer
 
 
 def bends(path: Path, config: TrackerConfig, geometry: FourWheelSteering) -> Iterator[tuple[Bend, float]]:
-    """Yield the places where the body leaves a path by more than the tolerance, each with the least radius (m)."""
+    """Yield the places where the body leaves a path by more than the tolerance, each with the minimum radius (m)."""
     poses = PosePath.of(path)
     count = len(poses.poses)
     if path.closed:
@@ -92,7 +92,7 @@ def bends(path: Path, config: TrackerConfig, geometry: FourWheelSteering) -> Ite
 
 
 def least_radius(steering: Steering, angle: float, geometry: FourWheelSteering) -> float:
-    """Return the least turning radius (m); +inf for a body that translates: its path may bend without a turn."""
+    """Return the minimum turning radius (m); +inf for a body that translates, whose path may bend without a turn."""
     return geometry.minimum_radius("counter" if steering == "hybrid" else steering, angle)
 
 
@@ -141,7 +141,7 @@ def _run_bends(points: Array, radius: float, tolerance: float) -> Iterator[Bend]
 
 
 def _excess(heading: Array, s: Array, radius: float) -> Array:
-    """Return for each step by how much (rad) it turns further from any step before than the body does on the way."""
+    """Return by how much each step turns further from any earlier step than the body can between both (rad)."""
     excess = np.zeros(len(heading))
     for side in (heading, -heading):
         earlier = np.minimum.accumulate(side[:-1] - s[1:-1] / radius)
@@ -157,7 +157,7 @@ def _cut(points: Array, s: Array, low: float, high: float) -> Array:
 
 
 def _deviation(points: Array, radius: float, enough: float) -> float:
-    """Return the least deviation among the look-ahead distances (m), or the first that is small enough."""
+    """Return the minimum deviation among the look-ahead distances (m), or the first that is small enough."""
     s = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))))
     step = radius / STEPS
     at = np.linspace(0.0, s[-1], max(math.ceil(s[-1] / step), 2) + 1)
@@ -174,7 +174,7 @@ def _chase(points: Array, radius: float, step: float, ahead: int, most: float) -
     """Drive along dense points at bounded curvature towards the point ``ahead`` of the nearest.
 
     Returns:
-        The largest distance from the points (m); +inf if it exceeds ``most`` or the body does not find back.
+        The maximum distance from the points (m); +inf if it exceeds ``most`` or the body does not return to them.
     """
     xs, ys = points.T.tolist()
     last, most = len(xs) - 1, most * most
@@ -208,10 +208,10 @@ def _chase(points: Array, radius: float, step: float, ahead: int, most: float) -
 
 
 def _jump(path: Path, tolerance: float) -> tuple[int, float] | None:
-    """Return the first step that leads further aside (m) than its headings allow, and the pose before it.
+    """Return the first step that moves further sideways (m) than its headings allow, and the pose before it.
 
-    An arc from pose to pose points along the mean of both headings. A path of positions only has headings that point
-    elsewhere in all its bends: they mean nothing.
+    An arc from pose to pose has the mean direction of both headings. In a path with positions only, the headings
+    disagree with that direction in every bend, and are meaningless.
     """
     poses = PosePath.of(path)
     steps, yaw = np.diff(poses.poses[:, :2], axis=0), np.unwrap(poses.poses[:, 2])

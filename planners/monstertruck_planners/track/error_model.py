@@ -1,4 +1,4 @@
-"""How the error from a path moves, linear: the model behind the optimal trackers.
+"""Linear model of the error from a path, for the optimal trackers.
 
 With e the distance left of the reference along its heading, p the yaw error, tan_f and tan_r the axles' tangents and v
 the forward speed (negative backwards), to first order
@@ -6,7 +6,7 @@ the forward speed (negative backwards), to first order
     de/dt = v (p + slip - slip_ref)      slip = (1 - c) tan_f + c tan_r      (eq. 2.34)
     dp/dt = v (turn - turn_ref)          turn = (tan_f - tan_r) / L          (eq. 2.37)
 
-and both axles follow requests with a first-order lag. A way of steering is a basis of (tan_f, tan_r).
+and both axles follow requests with a first-order lag. A steering mode is a basis of (tan_f, tan_r).
 """
 
 from dataclasses import dataclass
@@ -25,15 +25,15 @@ BASES: Final[dict[Steering, Array]] = {
     "crab": np.array([[1.0], [1.0]]),
     "hybrid": np.eye(2),
 }
-"""Columns: axle tangents (front, rear) of one unit of input."""
+"""Axle tangents (front, rear) per unit of each input, as columns."""
 
 LEAST_LAG: Final = 1e-3
-"""Axles that answer at once are taken to need this long, s."""
+"""Assumed minimum lag of the axles (s)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Discrete:
-    """x' = a x + b u + d r over one period; x = (e, p, axles), r = (tan slip_ref, turn_ref / cos slip_ref)."""
+    """Model x' = a x + b u + d r of one period; x = (e, p, axles), r = (tan slip_ref, turn_ref / cos slip_ref)."""
 
     a: Array
     b: Array
@@ -41,14 +41,14 @@ class Discrete:
 
 
 def discretise(geometry: FourWheelSteering, steering: Steering, speed: float, lag: float, period: float) -> Discrete:
-    """The model over one period with inputs and reference held, exactly.
+    """Return the exact model over one period with constant inputs and reference.
 
     Args:
         geometry: geometry of the truck.
-        steering: way of steering; its inputs are one or two.
-        speed: forward, m/s.
+        steering: steering mode, with one or two inputs.
+        speed: forward speed (m/s).
         lag: lag of the axles, s.
-        period: s.
+        period: period (s).
     """
     basis = BASES[steering]
     m = basis.shape[1]
@@ -67,7 +67,7 @@ def discretise(geometry: FourWheelSteering, steering: Steering, speed: float, la
 
 
 def exponential(matrix: Array) -> Array:
-    """E to the power of a small square matrix: Taylor series after halving, squared back."""
+    """Return the matrix exponential of a small matrix: scaling, Taylor series, and squaring."""
     halvings = max(int(np.ceil(np.log2(max(float(np.abs(matrix).sum(axis=1).max()), 1e-9)))) + 1, 0)
     small = matrix / 2.0**halvings
     result = term = np.eye(len(matrix))
@@ -80,7 +80,7 @@ def exponential(matrix: Array) -> Array:
 
 
 def riccati(a: Array, b: Array, q: Array, r: Array, tolerance: float = 1e-10, most: int = 40) -> Array:
-    """Stabilising solution of P = a'P a - a'P b (r + b'P b)^-1 b'P a + q, by structure-preserving doubling.
+    """Return the stabilising solution of P = a'P a - a'P b (r + b'P b)^-1 b'P a + q, by structure-preserving doubling.
 
     Source: Chu, Fan, Lin and Wang, International Journal of Control 77 (2004).
     """

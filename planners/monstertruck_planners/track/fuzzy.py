@@ -1,7 +1,7 @@
-"""The fuzzy tracker of rsband_local_planner: a sub-goal ahead on the path, rules, axle angles.
+"""Fuzzy tracker of rsband_local_planner: rules give axle angles from a sub-goal ahead on the path.
 
-As published its direction comes from the sub-goal's bearing and changes at 120 degrees from cycle to cycle; corrected
-it comes from the path, and the speed falls towards the end.
+In the published version the direction depends on the sub-goal's bearing, and may change at 120 degrees from cycle to
+cycle. In the corrected version it comes from the path, and the speed falls towards the end.
 """
 
 import math
@@ -17,19 +17,19 @@ from monstertruck_schemas.plan import Steering
 Membership = Callable[[float], float]
 
 SHARES: Final = {"RH": -1.0, "RL": -0.5, "Z": 0.0, "LL": 0.5, "LH": 1.0}
-"""Steering terms as shares of the greatest angle."""
+"""Steering terms as fractions of the maximum angle."""
 
 FAR_TURNS: Final = {
     "RBL": "Z", "RL": "LH", "SL": "LH", "FL": "LL", "FA": "Z", "FR": "RL", "SR": "RH", "RR": "RH", "RBR": "Z",
 }  # fmt: skip
-"""Front steering by the sub-goal's bearing, far from it."""
+"""Front steering by the bearing of a distant sub-goal."""
 CLOSE_TURNS: Final = {"SL": "LH", "FL": "LL", "FA": "Z", "FR": "RL", "SR": "RH"}
-"""Front steering by the sub-goal's orientation, close to it and forward; backward left and right change places."""
+"""Front steering by the orientation of a close sub-goal, driving forward; backward, left and right are swapped."""
 OPPOSITE: Final = {"LH": "RH", "LL": "RL", "Z": "Z", "RL": "LL", "RH": "LH"}
 
 
 def trapezoid(a: float, b: float, c: float, d: float) -> Membership:
-    """0 up to a, 1 from b to c, 0 from d on."""
+    """Trapezoidal membership: 0 up to a, 1 from b to c, 0 from d on."""
 
     def membership(x: float) -> float:
         rising = 1.0 if x >= b else (x - a) / (b - a) if x > a else 0.0
@@ -55,23 +55,23 @@ PUBLISHED_ORIENTATIONS: Final = BEARINGS | {"FR": trapezoid(-40, -30, -15, -10)}
 
 @dataclass(frozen=True, slots=True)
 class FuzzyInputs:
-    """The sub-goal seen from the truck."""
+    """Sub-goal as seen from the truck."""
 
     bearing: float
-    """Deg."""
+    """Bearing (deg)."""
     orientation: float
-    """Deg."""
+    """Orientation (deg)."""
     distance: float
-    """M."""
+    """Distance (m)."""
     aside: float
-    """Distance to the left, m."""
+    """Distance to the left (m)."""
     direction: float
     """+1 forward, -1 backward."""
 
 
 @dataclass(frozen=True, slots=True)
 class FuzzyOutputs:
-    """Shares of the greatest values; None where no rule fired."""
+    """Fractions of the maximum values; None if no rule fired."""
 
     speed: float | None
     front: float | None
@@ -80,12 +80,12 @@ class FuzzyOutputs:
 
 @dataclass(frozen=True, slots=True)
 class Rules:
-    """One rule base.
+    """A rule base.
 
     Args:
-        near: up to state the sub-goal is close, from twice as much on far, m.
-        tolerance: lateral deviation called small, m.
-        published: with its slips.
+        near: maximum distance of a close sub-goal (m); from twice this distance it is far.
+        tolerance: lateral deviation classified as small (m).
+        published: use the published rules with their errors.
     """
 
     near: float
@@ -93,7 +93,7 @@ class Rules:
     published: bool
 
     def infer(self, inputs: FuzzyInputs) -> FuzzyOutputs:
-        """Outputs by all rules."""
+        """Return the outputs of all rules."""
         far = min(max(inputs.distance / self.near - 1.0, 0.0), 1.0)
         close = 1.0 - far
         return FuzzyOutputs(
@@ -130,7 +130,7 @@ class Rules:
 
 
 def mean(fired: list[tuple[float, float]]) -> float | None:
-    """Weighted mean of conclusions; equal ones count once, with their greatest weight. None if all weights are 0."""
+    """Return the weighted mean of conclusions, equal ones with their maximum weight; None if all weights are 0."""
     weights: dict[float, float] = {}
     for weight, value in fired:
         weights[value] = max(weights.get(value, 0.0), weight)
@@ -139,7 +139,7 @@ def mean(fired: list[tuple[float, float]]) -> float | None:
 
 
 class Fuzzy(PathTracker[FuzzyConfig]):
-    """See the module."""
+    """Fuzzy tracker; see the module."""
 
     def __init__(self, config: FuzzyConfig, geometry: FourWheelSteering) -> None:
         super().__init__(config, geometry)
@@ -158,7 +158,7 @@ class Fuzzy(PathTracker[FuzzyConfig]):
         self._front = self._sideways = 0.0
 
     def steer(self, state: TrackingState) -> Angles:
-        """Axle angles; values without a rule stay as they were."""
+        """Return the axle angles; values without a rule are unchanged."""
         outputs = self._infer(state)[0]
         self._front = self._front if outputs.front is None else outputs.front
         self._sideways = self._sideways if outputs.sideways is None else outputs.sideways
@@ -168,7 +168,7 @@ class Fuzzy(PathTracker[FuzzyConfig]):
         return (0.0 if state.steering == "rear" else front), rear[state.steering]
 
     def limited(self, steering: Steering, front: float, rear: float) -> Angles:
-        """Each axle by itself."""
+        """Each axle independently."""
         angle = self.config.angle
         return min(max(front, -angle), angle), min(max(rear, -angle), angle)
 
@@ -182,7 +182,7 @@ class Fuzzy(PathTracker[FuzzyConfig]):
         return direction * min(abs(state.target_speed), max(most, self.config.min_speed))
 
     def _infer(self, state: TrackingState) -> tuple[FuzzyOutputs, float]:
-        """Result of the rules, and the direction."""
+        """Return the result of the rules, and the direction."""
         run, (x, y, yaw) = state.run, state.pose
         s = min(state.s + self.config.sub_goal, run.end)
         goal = run.at(s).point
@@ -190,7 +190,7 @@ class Fuzzy(PathTracker[FuzzyConfig]):
         ahead, aside = math.cos(yaw) * dx + math.sin(yaw) * dy, math.cos(yaw) * dy - math.sin(yaw) * dx
         bearing = math.degrees(math.atan2(aside, ahead))
         orientation = math.degrees(math.remainder(state.reference.state(s).yaw - yaw, math.tau))
-        # 120.0: sub-goals at a greater bearing are driven to backward, as published, deg
+        # 120.0: minimum bearing of a sub-goal that the truck approaches backward, as published, deg
         direction = (1.0 if abs(bearing) < 120.0 else -1.0) if self._published else run.direction
         inputs = FuzzyInputs(bearing, orientation, math.hypot(dx, dy), aside, direction)
         return self._rules.infer(inputs), direction

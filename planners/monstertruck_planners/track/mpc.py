@@ -1,13 +1,14 @@
 """Model-predictive control of both axles: a quadratic programme over the coming seconds, re-linearised at each step.
 
-Model: the error from the path as in ``error_model``, but with the axles' angles themselves, exact tangents and the
-curved frame of the path; dead time is bridged by prediction, lag is in the model, angles and rates are limits. States
-are eliminated (condensed form), so the programme has one or two unknowns per period. One linearisation per step, about
-the last plan moved on (real-time iteration: Diehl, Bock and Schloeder, SIAM J. Control Optim. 43, 2005).
+The model is the error from the path as in ``error_model``, but with the axle angles themselves, exact tangents and the
+curved frame of the path. Prediction bridges the dead time, the lag is in the model, and angles and rates are limits.
+States are eliminated (condensed form), so the programme has one or two unknowns per period. Each step linearises once
+about the last plan shifted by one period (real-time iteration: Diehl, Bock and Schloeder, SIAM J. Control Optim. 43,
+2005).
 
-The programme is solved exactly, by a dual active-set method (DAQP: Arnstrom, Bemporad and Axehill, IEEE Transactions on
-Automatic Control 67, 2022): it begins at the best plan without limits and takes in those that it breaks, one by one, so
-a step that meets limits takes hardly longer than one that meets none, and equal inputs give equal outputs.
+The programme is solved exactly by a dual active-set method (DAQP: Arnstrom, Bemporad and Axehill, IEEE Transactions on
+Automatic Control 67, 2022). It starts at the unconstrained optimum and adds the violated limits one by one. A step at
+its limits therefore takes hardly longer than an unlimited one, and equal inputs give equal outputs.
 """
 
 import math
@@ -43,12 +44,12 @@ class Layout:
 
 @dataclass(frozen=True, slots=True)
 class Rollout:
-    """Errors along a plan, at the end of each fine step, and their derivatives by the plan."""
+    """Errors along a plan at the end of each fine step, and their derivatives."""
 
     errors: Array
-    """Shape (2 f,): distance, then yaw error."""
+    """Distances, then yaw errors, shape (2 f,)."""
     by_plan: Array
-    """Shape (2 f, n)."""
+    """Derivatives by the plan, shape (2 f, n)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,11 +57,11 @@ class Terminal:
     """Errors after the last period, their derivatives by the plan, and their infinite-horizon cost."""
 
     errors: Array
-    """Shape (2,)."""
+    """Distance and yaw error, shape (2,)."""
     by_plan: Array
-    """Shape (2, unknowns)."""
+    """Derivatives by the plan, shape (2, unknowns)."""
     cost: Array
-    """Shape (2, 2)."""
+    """Weights of the infinite-horizon cost, shape (2, 2)."""
 
 
 class Mpc(PathTracker[MpcConfig]):
@@ -149,7 +150,7 @@ class Mpc(PathTracker[MpcConfig]):
         turn = cosine * (tangents[:, 0] - tangents[:, 1]) / base
         steps = self._h * state.speeds(self._middles)
         errors = self._integrate(state, reference, turn, np.arctan(slip_tangent), steps)
-        # One column of axle angles per input, then sums along the way.
+        # One column of axle angles per input, then sums along the path.
         effect = layout.effect * slopes[:, :, None]
         by_step = (steps * cosine / base)[:, None] * (effect[:, 0] - effect[:, 1])
         by_turn = by_step.cumsum(axis=0)
@@ -177,7 +178,7 @@ class Mpc(PathTracker[MpcConfig]):
         return np.array(sides + yaws)
 
     def _weights(self, modes: tuple[Steering, ...]) -> Array:
-        """Weights of the squared errors, shape (2 f,)."""
+        """Return the weights of the squared errors, shape (2 f,)."""
         config = self.config
         free = np.repeat([mode == "crab" for mode in modes], self._fine // self._periods)
         heading = np.where(free, 0.0, self._h / config.heading_scale**2)

@@ -132,7 +132,7 @@ class AxleModel:
         angles = self.angles
         begin = self._t or 0.0
         for _, duration, target in self._pieces(begin, begin + seconds):
-            count = max(math.ceil(duration / 0.05), 1)  # greatest time step of the prediction, s
+            count = max(math.ceil(duration / 0.05), 1)  # maximum time step of the prediction, s
             for _ in range(count):
                 middle = self._turned(angles, target, 0.5 * duration / count)
                 pose = geometry.integrate(
@@ -174,42 +174,43 @@ class AxleModel:
 
 
 class TruckState(NamedTuple):
-    """A tracker's knowledge of the truck."""
+    """State of the truck as known to a tracker."""
 
     pose: tuple[float, float, float]
-    """x, y (m), yaw (rad) in the path's frame."""
+    """Pose in the path's frame: x, y (m), yaw (rad)."""
     speed: float
-    """Forward speed, m/s."""
+    """Forward speed (m/s)."""
     clearance: float = math.inf
-    """Room around the footprint along the next part of the path, m."""
+    """Clearance around the footprint along the next part of the path (m)."""
     tilt: float = 0.0
-    """Angle between the truck's z axis and the vertical, rad."""
+    """Angle between the truck's z axis and the vertical (rad)."""
     roughness: float = 0.0
-    """Standard deviation of the tilt over the last seconds, rad."""
+    """Standard deviation of the tilt over the last seconds (rad)."""
     obeyed: bool = True
     """Whether the axles follow the tracker's requests."""
     heading: tuple[float, float] | None = None
-    """Instant (s) and yaw (rad, in any frame) of a measurement that does not depend on the requests; None: there is no
-    compass, and the pose's yaw shows how the truck turns."""
+    """Stamp (s) and yaw (rad, in any frame) of a measurement that is independent of the requests; None without a
+    compass: then the yaw of the pose shows the truck's turn.
+    """
     located: bool = True
     """Whether the pose is measured, not computed from the requests."""
 
 
 @dataclass(slots=True)
 class Command:
-    """What to do now, and how the tracking goes."""
+    """Command of one control step, and the state of the tracking."""
 
     speed: float
-    """Speed of the base point along its direction of travel, m/s; negative backwards."""
+    """Speed of the base point in its direction of travel (m/s); negative backward."""
     front: float
     rear: float
     progress: PathProgress
     cross_track: float
-    """Distance of the base point from the path, m; positive left of it, seen in the direction of travel."""
+    """Distance of the base point from the path (m), positive to the left in the direction of travel."""
     heading_error: float
-    """Yaw relative to the path, rad."""
+    """Yaw relative to the path (rad)."""
     outcome: Reason
-    """DRIVING, GOAL_REACHED, GOAL_MISSED, CUSP_MISSED, PATH_LOST, NOT_FINITE, or of the service STUCK."""
+    """DRIVING, GOAL_REACHED, GOAL_MISSED, CUSP_MISSED, PATH_LOST, NOT_FINITE, or STUCK from the service."""
 
 
 class SpeedProfile:
@@ -246,7 +247,7 @@ def target_speed(
 ) -> float:
     """Return the speed along the run (m/s) at ``s`` m that takes effect after ``dead_time`` s; signed by direction."""
     if truck.speed * run.direction < -config.min_speed:
-        return 0.0  # still rolling the other way
+        return 0.0  # still rolling in the opposite direction
     speed = config.speed if run.direction > 0 else config.reverse_speed
     speed *= min(max(truck.clearance, 0.0) / config.slow_clearance, 1.0)
     speed *= speed_share(truck.tilt, config.slow_tilt) * speed_share(truck.roughness, config.slow_roughness)
@@ -357,7 +358,7 @@ class PathTracker(ABC, Generic[C]):
         self._prepared.clear()
 
     def limit_learning(self, freedom: Freedom | None) -> None:
-        """Learn only errors that a body with this freedom can have; None for unsteered axles."""
+        """Restrict learning to the errors that a body with this freedom can have; None for unsteered axles."""
         self.axle_errors = AxleErrorEstimator(self.geometry, freedom)
 
     @property
@@ -378,10 +379,10 @@ class PathTracker(ABC, Generic[C]):
 
     @abstractmethod
     def steer(self, state: TrackingState) -> Angles:
-        """Wanted angles of front and rear axle, rad, not yet limited."""
+        """Return the wanted angles of front and rear axle (rad), without limits."""
 
     def prepare(self, path: SegmentedPath, progress: PathProgress) -> bool:
-        """Prepare the path's current run for ``control``, once; return whether that was necessary."""
+        """Prepare the path's current run for ``control`` once; return whether this was necessary."""
         run = path.runs[progress.run]
         known = self._prepared.get(id(run))
         if known is not None and known[0] is run:
@@ -390,13 +391,13 @@ class PathTracker(ABC, Generic[C]):
         return True
 
     def control(self, truck: TruckState, path: SegmentedPath, progress: PathProgress, t: float) -> Command:
-        """One control step.
+        """Compute one control step.
 
         Args:
-            truck: its state at ``t``.
-            path: what to follow.
-            progress: place reached at the step before, ``path.start`` at first.
-            t: s, growing.
+            truck: state of the truck at ``t``.
+            path: path to follow.
+            progress: place reached in the previous step, initially ``path.start``.
+            t: increasing time (s).
         """
         self.axles.advance(t)
         if not all(map(math.isfinite, (*truck.pose, truck.speed))):
@@ -458,10 +459,10 @@ class PathTracker(ABC, Generic[C]):
         if last:
             reached = away <= config.goal_tolerance and turned <= config.goal_yaw_tolerance
             return Reason.GOAL_REACHED if reached else Reason.GOAL_MISSED
-        # 0.5: share of the clearance at a cusp that the truck may be off there: the rest is for the motion after it
-        # 0.01: however narrow it is, m
+        # 0.5: usable share of the clearance at a cusp; the rest is for the motion after it 0.01: minimum tolerance at a
+        # cusp, m
         tolerance = max(0.5 * run.clearance, 0.01)
-        # A corner moves by about the wheelbase for each radian.
+        # A corner moves by about one wheelbase per radian.
         off = away + self.geometry.wheelbase * turned
         return Reason.OK if off <= tolerance else Reason.CUSP_MISSED
 
@@ -483,7 +484,7 @@ class PathTracker(ABC, Generic[C]):
         return float(front), float(rear)
 
     def _request(self, steering: Steering, wheels: Angles, speed: float) -> Angles:
-        """Return the request that turns the truck as axles at these angles would; an unsteered axle stays."""
+        """Return the request that turns the truck like these effective angles; an unsteered axle stays."""
         errors, grip, most = self.axle_errors.errors, speed * speed / self.geometry.wheelbase, self.config.angle
         front, rear = errors.requests(wheels, grip)
         turn = wheels[0] - wheels[1]

@@ -1,4 +1,4 @@
-"""Configured paths and paths of operators, published for the trackers."""
+"""Publisher of configured paths and operators' paths for the trackers."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path as FilePath
@@ -21,10 +21,10 @@ from monstertruck_schemas.state import GateState
 
 
 def load_path(file: FilePath, *, closed: bool, frame: str = "odom", columns: Sequence[str] = ()) -> Path:
-    """Read a path that can be tracked; see ``path_from``.
+    """Load a path for tracking; see ``path_from``.
 
     Raises:
-        InputError: naming file, line and expectation.
+        InputError: the file is invalid; the error names file, line and expected value.
     """
     path = path_from(text_of(file, EXPECTED, LARGEST_PATH_FILE), file, closed=closed, frame=frame, columns=columns)
     try:
@@ -35,26 +35,26 @@ def load_path(file: FilePath, *, closed: bool, frame: str = "odom", columns: Seq
 
 
 class PathService:
-    """Publishes the configured path, and replaces it by any that an operator sends while the truck stands.
+    """Publish the configured path, and replace it by a path that an operator sends while the truck stands.
 
-    A request for the current path that ``halts`` withdraws it, whether the truck stands or not. Started by name, the
-    configured path is driven once: a truck that was disarmed on the way does not continue when it is armed again.
+    A request that repeats the current path with ``halts`` withdraws it, even while the truck drives. The configured
+    path, if started by name, is driven once: a truck disarmed during it does not continue when armed again.
 
-    A path that the body cannot drive is refused with the place.
+    A path that the body cannot drive is refused, with the place of the first impossible bend.
 
     Args:
-        drawn: the configured path, which the body can drive.
+        drawn: configured path, which the body can drive.
         at_once: follow it as soon as the truck is armed, without a start by name.
-        clock: time.
+        clock: the service's clock.
         requests: ``req/path``.
         gate: state of the gate.
         behaviour: ``plan/behaviour``.
-        present: ``plan/path``, others' paths as well.
-        out: ``plan/path``.
-        events: where events go.
-        max_age: seconds; see ``GateConfig.max_request_age``.
+        present: ``plan/path``, including paths of other sources.
+        out: publisher of ``plan/path``.
+        events: event sink.
+        max_age: maximum age of a request (s); see ``GateConfig.max_request_age``.
         require_drivable: raises an ``InputError`` for a path that the body cannot drive; takes up to 0.2 s.
-        offload: runs it outside the event loop.
+        offload: runs that check outside the event loop.
     """
 
     name = ServiceName.PATH.value
@@ -106,11 +106,11 @@ class PathService:
                 self._publish(path)
 
     def start(self, request: PathStart) -> str:
-        """Have the armed truck drive the configured path from here on; returns the name under which it is followed.
+        """Let the armed truck follow the configured path from now on; return its name.
 
         Raises:
             NotFoundError: the configuration has no path of this name.
-            RequestRefusedError: the sender may not, or not now.
+            RequestRefusedError: the sender lacks permission, or the truck's state does not allow it.
         """
         drawn, gate = self._drawn, self._gate.latest
         if drawn is None or drawn.name != request.path:
@@ -124,10 +124,10 @@ class PathService:
         return name
 
     def _withdrawn(self, request: PathRequest) -> Path:
-        """The current path, to be followed until the truck is disarmed at most.
+        """Return the current path; the truck follows it until it is disarmed, at most.
 
         Raises:
-            RequestRefusedError: the sender may not, or the path has been replaced.
+            RequestRefusedError: the sender lacks permission, or the path has been replaced.
         """
         examine(request, self._gate.latest, self._sequences, self._clock.now(), None)
         present = self._present.latest
@@ -136,10 +136,10 @@ class PathService:
         return present.model_copy(update={"halts": True})
 
     async def _examined(self, request: PathRequest) -> Path:
-        """The path of a request.
+        """Return the path of a request.
 
         Raises:
-            RequestRefusedError: the sender may not, or not now.
+            RequestRefusedError: the sender lacks permission, or the truck's state does not allow it.
             InputError: the body cannot drive the path.
         """
         self._examine(request, self._sequences)
@@ -149,10 +149,10 @@ class PathService:
         return request.path
 
     def _examine(self, request: Request, sequences: Sequences) -> None:
-        """Require authority as for driving, and a truck that stands: a path must not turn under it.
+        """Require driving authority and a truck at standstill: its path must not change while it moves.
 
         Raises:
-            RequestRefusedError: the sender may not, or not now.
+            RequestRefusedError: the sender lacks permission, or the truck's state does not allow it.
         """
         examine(request, self._gate.latest, sequences, self._clock.now(), self._max_age)
         self._require_rest()
@@ -170,7 +170,7 @@ class PathService:
         self._out.put(path.model_copy(update={"stamp": now, "received": now, "seq": self._out.next_seq()}))
 
     def register(self, rpc: RpcRegistry) -> None:
-        """Serve ``start_path``, whose payload is a ``PathStart``; the answer has the ``path`` that is followed."""
+        """Serve ``start_path`` with a ``PathStart`` as payload; the answer contains the followed ``path``."""
 
         async def start_path(payload: dict[str, Any]) -> dict[str, Any]:
             return {"path": self.start(parse_request(PathStart, payload))}

@@ -36,10 +36,10 @@ class PurePursuit(PathTracker[PurePursuitConfig]):
             # The turning centre lies abeam of the base point: the arc is tangent to the truck there.
             turn = 2 * aside / max(ahead**2 + aside**2, LEAST_SQUARE)
         elif arm * direction < 0:
-            # The turning centre lies abeam of the rear axle; still it is the base point that has to meet the goal.
+            # The turning centre lies abeam of the rear axle, but the base point must reach the goal.
             turn = 2 * aside / max(ahead**2 + aside**2 - 2 * arm * ahead, LEAST_SQUARE)
         else:
-            # The fixed axle leads, and only its own arc is stable: it has to meet its own goal.
+            # The fixed axle leads, and only its own arc is stable: that axle must reach its own goal.
             tangent = goal.tangent - yaw
             lead = abs(arm)
             ahead += lead * math.cos(tangent) - arm

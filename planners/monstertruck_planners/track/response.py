@@ -1,9 +1,10 @@
 """Online estimate of the axles' response to requests: dead time and lag, from the turns that requests cause.
 
-Candidates are all pairs of a dead time and a lag. Each candidate predicts the turn between two poses from the requests
-and the speed. Measured turns are regressed on it with a gain (the linkage may turn less than it should) and a trim (the
-axles may be off centre), with priors near 1 and 0. The residuals give each candidate its probability. Turns that all
-candidates predict equally carry no information: they are left out, so the estimate does not fade on a straight.
+The candidates are all pairs of a dead time and a lag. Each candidate predicts the turn between two poses from the
+requests and the speed. Measured turns are regressed on the prediction with a gain (the linkage may turn less than
+expected) and a trim (the axles may be off centre), with priors near 1 and 0. The residuals give each candidate its
+probability. Turns that all candidates predict equally carry no information and are ignored, so the estimate does not
+fade on a straight.
 """
 
 import math

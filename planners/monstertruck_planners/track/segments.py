@@ -33,7 +33,7 @@ class PathProgress:
     run: int = 0
     """Index of the run."""
     s: float = 0.0
-    """Metres from the run's beginning."""
+    """Distance from the run's start (m)."""
     outcome: Reason = Reason.DRIVING
     """Outcome at the end of the path, once judged."""
 
@@ -51,15 +51,15 @@ class PathRun:
     """Part of a path driven without a stop, with a straight or given extension past its end.
 
     Args:
-        points: shape (n, 2), n >= 2, m; from index ``last`` on they are the extension.
+        points: points, shape (n, 2), n >= 2 (m); from index ``last`` on they are the extension.
         last: index of the run's own last point.
         direction: +1 forward, -1 backward.
         before: total length of the previous runs (m).
-        yaws: yaws at the run's points, shape (last + 1,), rad.
+        yaws: yaws at the run's points, shape (last + 1,) (rad).
         steering: steering mode of each step of the run, or empty.
         lap: whether the extension is the start of the same path.
         clearance: clearance between footprint and obstacles at the end (m).
-        speeds: maximum speeds at the run's points, shape (last + 1,), m/s; None: the path sets none.
+        speeds: maximum speeds at the run's points, shape (last + 1,) (m/s); None without limits on the path.
     """
 
     def __init__(
@@ -134,7 +134,7 @@ class PathRun:
 
 
 def _nearest_step(steps: Array, x: float, y: float, low: float, high: float) -> list[int]:
-    """The one of many steps that comes nearest to a point, as above."""
+    """Return the nearest point for runs of many steps, as above."""
     px, py, dx, dy, length, begin, _ = steps.T
     along = np.minimum(np.maximum(((x - px) * dx + (y - py) * dy) / length, 0.0), length)
     share = (np.minimum(np.maximum(begin + along, low), high) - begin) / length
@@ -212,7 +212,7 @@ def check_path(path: Path) -> None:
         _refuse(path, f"poses: expected finite ones, at most {MAX_COORDINATE:g} m and rad")
     step = np.diff(poses[:, :2], axis=0, append=poses[:1, :2] if path.closed else poses[-1:, :2])
     length = np.hypot(step[:, 0], step[:, 1])
-    max_step = 100.0  # metres between two poses
+    max_step = 100.0  # maximum distance between two poses, m
     if not LEAST_STEP < length.max() <= max_step:
         _refuse(path, f"steps of up to {length.max():g} m: expected different poses, at most {max_step:g} m apart")
     if len(path.name) > MAX_NAME:
@@ -257,7 +257,7 @@ def _rolled(lap: PosePath, first: int) -> PosePath:
 
 
 def _nearest(points: Array, directions: Array, start: tuple[float, float, float], *, closed: bool) -> int:
-    """Return the start vertex: the nearest; among equally near ones, the first with the truck's heading."""
+    """Return the start vertex: the nearest; of equally near ones, the first with the truck's heading."""
     step = np.diff(points, axis=0)
     tangents = np.arctan2(step[:, 1], step[:, 0]) + np.where(directions > 0, 0.0, math.pi)
     distance = np.hypot(points[:, 0] - start[0], points[:, 1] - start[1])
@@ -351,7 +351,7 @@ class RunStates:
     def __init__(self, run: PathRun, geometry: FourWheelSteering, steering: Steering) -> None:
         self._segment = run
         self._default: Steering = steering
-        count = min(max(math.ceil(run.end / PATH_GRID), 4), 5000) + 1  # greatest number of reference points of a run
+        count = min(max(math.ceil(run.end / PATH_GRID), 4), 5000) + 1  # maximum number of reference points of a run
         self._s = np.linspace(0.0, run.end, count)
         tangent, curvature = _tangents(run, self._s)
         heading = tangent if run.direction > 0 else tangent + math.pi
@@ -392,7 +392,7 @@ class RunStates:
         return self.steering(s) != "crab"
 
     def steerings(self, s: Array) -> list[Steering]:
-        """The same at several places."""
+        """Whether the path prescribes the body yaw at several places."""
         return self._modes(s) if self.given else [self._default] * len(s)
 
     def at(self, s: Array) -> ReferenceStates:
@@ -400,7 +400,7 @@ class RunStates:
         return ReferenceStates(*(np.asarray(np.interp(s, self._s, column)) for column in self._table))
 
     def state(self, s: float) -> ReferenceState:
-        """The same at one place."""
+        """Return the values at one place, clamped to the ends of the run."""
         last = len(self._rows) - 1
         i = int(self._s.searchsorted(s, "right")) - 1
         if not 0 <= i < last:

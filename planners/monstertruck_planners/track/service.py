@@ -1,4 +1,4 @@
-"""The tracker as a service: poses and a path in, drive requests to the gate out."""
+"""Tracker service: reads poses and a path, and sends drive requests to the gate."""
 
 import asyncio
 import functools

@@ -1,1 +1,1 @@
-"""Keepout and speed zones: read, served, and turned into ground for planners and gate."""
+"""Keepout and speed zones: loading, service, and conversion to ground for planners and gate."""

@@ -10,23 +10,23 @@ from monstertruck_schemas.zones import ZoneArea
 
 KEEPOUT_MASK: Final = "keepout_mask"
 SPEED_MASK: Final = "speed_mask"
-"""Names of the zones of the two masks."""
+"""Zone names of the two masks."""
 
 
 class KeepoutMaskConfig(Schema):
-    """Keepout zones as a picture."""
+    """Keepout zones as a mask image."""
 
     map: Path
     """map_server YAML file; cells of value 100 are keepout"""
     inside: Literal["stop", "leave"] = "stop"
-    """What a robot does that finds itself inside: stand and report, or leave slowly"""
+    """Reaction of a robot inside a zone: stop and report, or leave slowly"""
 
 
 class SpeedMaskConfig(Schema):
-    """Speed zones as a picture, with the numbers of Nav2's CostmapFilterInfo.
+    """Speed zones as a mask image, with the parameters of Nav2's CostmapFilterInfo.
 
-    The limit of a cell is ``base + multiplier * value``. Cells of value 0, unknown cells and limits that are not above
-    0 mean no limit.
+    The limit of a cell is ``base + multiplier * value``. Cells of value 0, unknown cells and limits of 0 or less impose
+    no limit.
     """
 
     map: Path
@@ -45,15 +45,15 @@ class ZonesConfig(Schema):
     areas: dict[Name, ZoneArea] = Field(default_factory=dict)
     """Polygons by name"""
     file: Path | None = None
-    """YAML file with more polygons: the key `zones`, as `areas` here"""
+    """YAML file with more polygons under the key `zones`, in the format of `areas`"""
     keepout_mask: KeepoutMaskConfig | None = None
-    """Mask image of keepout zones, such as one made for Nav2"""
+    """Mask image of keepout zones, e.g. one made for Nav2"""
     speed_mask: SpeedMaskConfig | None = None
     """Mask image of speed zones"""
     margin: NotNegative = 0.05
-    """Clearance from zones (m), for errors of the pose"""
+    """Clearance from zones for pose errors (m)"""
     leave_speed: Annotated[float, Field(ge=0.02, le=1)] = 0.1
-    """Maximum speed inside a keepout zone that the robot leaves (m/s)"""
+    """Maximum speed of a robot that leaves a keepout zone (m/s)"""
 
     @field_validator("areas")
     @classmethod
@@ -65,7 +65,7 @@ def require_free_names(areas: dict[str, ZoneArea]) -> dict[str, ZoneArea]:
     """Return the areas.
 
     Raises:
-        ValueError: one has the name of a mask.
+        ValueError: an area has the name of a mask.
     """
     if taken := areas.keys() & {KEEPOUT_MASK, SPEED_MASK}:
         raise ValueError(f"{min(taken)}: expected another name, because a mask has this one")

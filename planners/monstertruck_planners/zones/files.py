@@ -1,4 +1,4 @@
-"""Zones from files: polygons, mask images, and those that operators made."""
+"""Zone files: polygons, mask images, and zones made by operators."""
 
 import json
 from pathlib import Path
@@ -31,7 +31,7 @@ LARGEST_ZONE_FILE: Final = 2_000_000
 
 
 class ZoneFile(Schema):
-    """A file of polygons."""
+    """Content of a polygon file."""
 
     zones: dict[Name, ZoneArea] = Field(default_factory=dict)
     """Polygons by name."""
@@ -43,19 +43,19 @@ class ZoneFile(Schema):
 
 
 def zone_of(name: str, area: ZoneArea, *, saved: bool) -> Zone:
-    """Zone of a polygon; ``saved``: an operator made it."""
+    """Return the zone of a polygon; ``saved`` marks a zone made by an operator."""
     return Zone(name=name, kind=area.kind, corners=area.corners, limit=area.limit, inside=area.inside, saved=saved)
 
 
 def configured(config: ZonesConfig, max_speed: float) -> tuple[list[Zone], list[str]]:
-    """Zones of a configuration, and remarks on its mask images.
+    """Return the zones of a configuration, and remarks on its mask images.
 
     Args:
         config: configuration of the zones.
-        max_speed: to which percents of a speed mask refer (m/s).
+        max_speed: reference of the percentages in a speed mask (m/s).
 
     Raises:
-        InputError: file, key and expectation of whatever is wrong.
+        InputError: a file is invalid; the error names file, key and expected value.
     """
     zones = [zone_of(name, area, saved=False) for name, area in config.areas.items()]
     if config.file is not None:
@@ -69,7 +69,7 @@ def configured(config: ZonesConfig, max_speed: float) -> tuple[list[Zone], list[
 
 
 def _masks(config: ZonesConfig, max_speed: float) -> tuple[list[Zone], list[str]]:
-    """Zones of the mask images, and remarks on them; arguments as for ``configured``."""
+    """Return the zones of the mask images, and remarks on them; arguments as for ``configured``."""
     zones: list[Zone] = []
     remarks: list[str] = []
     if config.keepout_mask is None and config.speed_mask is None:
@@ -92,12 +92,12 @@ def _masks(config: ZonesConfig, max_speed: float) -> tuple[list[Zone], list[str]
 
 
 def speed_limits(world: "WorldMap", config: SpeedMaskConfig, max_speed: float) -> np.ndarray:
-    """Speed limit of each cell of a mask, as Nav2's speed filter reads it, m/s; +inf without a limit.
+    """Return the speed limit of each cell of a mask, as Nav2's speed filter reads it (m/s); +inf without a limit.
 
     Args:
-        world: the mask.
-        config: how values become limits.
-        max_speed: 100 percent (m/s).
+        world: mask.
+        config: conversion of values to limits.
+        max_speed: speed at 100 percent (m/s).
     """
     limits = config.base + config.multiplier * world.cells.astype(np.float64)
     none = (world.cells <= 0) | (limits <= 0.0)
@@ -116,7 +116,7 @@ def _masked(name: str, limits: np.ndarray, world: "WorldMap", inside: str, file:
 
 
 def load_saved(file: Path) -> dict[str, ZoneArea]:
-    """Zones that operators made, by name; empty if there is no file.
+    """Load the zones made by operators, by name; empty without a file.
 
     Raises:
         InputError: the file is damaged.
@@ -128,9 +128,9 @@ def load_saved(file: Path) -> dict[str, ZoneArea]:
 
 
 def save(file: Path, areas: dict[str, ZoneArea]) -> None:
-    """Write the zones that operators made.
+    """Save the zones made by operators.
 
     Raises:
-        OSError: it could not be written; the file is the one before.
+        OSError: the file could not be written and is unchanged.
     """
     replace_file(file, ZoneFile(zones=areas).model_dump_json(indent=1, exclude_none=True))

@@ -1,4 +1,4 @@
-"""Zone service: publishes the zones in force and those that the robot is in, and takes the operators' orders."""
+"""Zone service: publishes the zones in force and those around the robot, and handles operators' requests."""
 
 import asyncio
 from collections.abc import Mapping
@@ -25,26 +25,26 @@ from monstertruck_schemas.zones import Zone, ZoneArea, ZoneOrder, ZoneRequest, Z
 
 @dataclass(frozen=True, slots=True)
 class ZoneInputs:
-    """Topics read."""
+    """Topics that the service reads."""
 
     gate: Subscription[GateState]
     pose: Subscription[Odometry]
-    """Pose in map, or in the frame that is taken for it."""
+    """Pose in map, or in the frame used instead."""
 
 
 class ZoneService:
-    """Keeps the zones of one robot.
+    """Manage the zones of one robot.
 
     Args:
         config: zones of the configuration.
-        clock: time.
-        max_speed: 100 percent of a speed mask (m/s).
+        clock: the service's clock.
+        max_speed: speed at 100 percent of a speed mask (m/s).
         footprint: outline of the robot.
-        file: the operators' zones; None if they are not kept after the end.
-        inputs: topics read.
-        out: ``state/zones``.
-        events: receives changes.
-        offload: runs the reading and writing of files.
+        file: file of the operators' zones; None to discard them at the end.
+        inputs: topics that the service reads.
+        out: publisher of ``state/zones``.
+        events: sink of changes.
+        offload: runs file access outside the event loop.
         max_age: see ``GateConfig.max_request_age``.
     """
 
@@ -69,7 +69,7 @@ class ZoneService:
         self._sequences = Sequences(max_age)
         self._zones: dict[str, Zone] = {}
         self._areas: dict[str, ZoneArea] = {}
-        """Zones that operators made."""
+        """Zones made by operators."""
         self._layer = ZoneLayer()
         self._inside: frozenset[str] = frozenset()
         self._published: tuple[object, ...] | None = None
@@ -91,7 +91,7 @@ class ZoneService:
         for remark in remarks:
             self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, remark)
         made = (files.zone_of(name, area, saved=True) for name, area in self._areas.items())
-        # A zone of the configuration counts, not an operator's of the same name from before.
+        # A zone of the configuration replaces an operator's zone of the same name.
         self._replace({zone.name: zone for zone in (*made, *zones)})
         self._publish()
         ready()
@@ -111,14 +111,14 @@ class ZoneService:
                 self._turn_on(zone, "its time off has expired")
 
     def _look(self) -> None:
-        """Update the zones that the robot is in, while its pose is fresh."""
+        """Update the zones that contain the robot, while its pose is fresh."""
         odometry = self._in.pose.latest
         if odometry is None or self._clock.now() - odometry.received > POSE.fresh_for() * SECOND:
             return
         pose = (odometry.pose.x, odometry.pose.y, odometry.pose.yaw)
         entered = {shape.zone.name for shape, _ in self._layer.reached(self._footprint, pose)}
         beside = {shape.zone.name for shape, _ in self._layer.reached(self._footprint, pose, self._config.margin)}
-        inside = frozenset(entered | (self._inside & beside))  # at an edge it is not left again and again
+        inside = frozenset(entered | (self._inside & beside))  # prevents repeated changes at an edge
         for name in sorted(inside - self._inside):
             zone = self._zones[name]
             alarming = zone.kind == "keepout" and zone.off_until is None
@@ -129,7 +129,7 @@ class ZoneService:
         self._inside = inside
 
     def _publish(self) -> None:
-        """Publish the zones if anything has changed."""
+        """Publish the zones after a change."""
         zones = tuple(self._zones.values())
         inside = tuple(zone.name for zone in zones if zone.name in self._inside)
         seen = (*map(id, zones), inside)
@@ -150,11 +150,11 @@ class ZoneService:
     # Orders
 
     async def take(self, request: ZoneRequest) -> None:
-        """Carry out an order; added and removed zones are on the disk afterwards.
+        """Execute a request; added and removed zones are on disk when it returns.
 
         Raises:
-            RequestRefusedError: the sender may not, or the change cannot be saved.
-            NotFoundError: no zone has this name.
+            RequestRefusedError: the sender lacks permission, or the change cannot be saved.
+            NotFoundError: no zone has the given name.
             InputError: a zone of the configuration has this name, or a new zone has no area.
         """
         examine(request, self._in.gate.latest, self._sequences, self._clock.now(), None)
@@ -197,10 +197,10 @@ class ZoneService:
             raise InputError(f"zone {zone.name!r}: is defined in the configuration: expected to be {what} there")
 
     async def _save(self, areas: dict[str, ZoneArea]) -> None:
-        """Write the operators' zones and keep them.
+        """Save the operators' zones and keep them.
 
         Raises:
-            RequestRefusedError: they cannot be written, and nothing has changed.
+            RequestRefusedError: the zones cannot be written, and none has changed.
         """
         if (file := self._file) is not None:
             async with self._writing:
@@ -211,7 +211,7 @@ class ZoneService:
         self._areas = areas
 
     def register(self, rpc: RpcRegistry) -> None:
-        """Serve ``zones``, answered once the order is carried out."""
+        """Serve ``zones``; each answer follows the execution of the request."""
 
         async def zones(payload: dict[str, Any]) -> dict[str, Any]:
             await self.take(parse_request(ZoneRequest, payload))

@@ -1,4 +1,4 @@
-"""Ground of zones: boundaries as points for sweeps, limits at points, and cells of grids."""
+"""Ground of zones: boundary points for sweeps, limits at points, and cells of grids."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -17,17 +17,17 @@ SPACING: Final = 0.02
 
 
 class Boundary(NamedTuple):
-    """Points of boundaries."""
+    """Points on boundaries of zones."""
 
     points: Array
-    """Shape (n, 2), m."""
+    """Points, shape (n, 2) (m)."""
     limits: Array
-    """Maximum speed on the slower side of each point, shape (n,), m/s; 0 = keepout."""
+    """Maximum speed on the slower side of each point, shape (n,) (m/s); 0 for keepout."""
     zones: NDArray[np.intp]
-    """Index of the zone of each point, shape (n,)."""
+    """Index of each point's zone, shape (n,)."""
 
     def of(self, which: NDArray[np.bool_]) -> "Boundary":
-        """Part of the points, by a mask of shape (n,)."""
+        """Return the points selected by a mask of shape (n,)."""
         return Boundary(self.points[which], self.limits[which], self.zones[which])
 
 
@@ -55,7 +55,7 @@ class ZoneShape:
         return (mine.corners, mine.limit) == (zone.corners, zone.limit) and mine.mask is zone.mask
 
     def limits_at(self, points: Array) -> Array:
-        """Maximum speed at points, shape (..., 2), m; shape (...), m/s; +inf outside the zone."""
+        """Return the maximum speeds at points, shape (..., 2) (m), as shape (...) (m/s); +inf outside the zone."""
         mask = self.zone.mask
         if mask is None:
             return np.where(inside(points, self._corners), self._limit, np.inf)
@@ -69,8 +69,8 @@ class ZoneLayer:
     """Ground of several zones.
 
     Args:
-        zones: those in force.
-        before: former layer; shapes of unchanged zones are taken over.
+        zones: zones in force.
+        before: previous layer, whose shapes of unchanged zones are reused.
     """
 
     def __init__(self, zones: Iterable[Zone] = (), before: "ZoneLayer | None" = None) -> None:
@@ -88,15 +88,15 @@ class ZoneLayer:
         )
 
     def near(self, place: tuple[float, float], reach: float) -> Boundary:
-        """Boundary points within a square around a place, ``reach`` (m) to each side."""
+        """Return the boundary points in a square around a place, ``reach`` (m) to each side."""
         x, y = self.boundary.points.T
         return self.boundary.of((np.abs(x - place[0]) <= reach) & (np.abs(y - place[1]) <= reach))
 
     def reached(self, footprint: Footprint, pose: Pose2, margin: float = 0.0) -> Iterator[tuple[ZoneShape, float]]:
-        """Zones that a footprint reaches into, each with its lowest limit there (m/s).
+        """Return the zones overlapped by a footprint, each with its lowest limit there (m/s).
 
         Args:
-            footprint: outline.
+            footprint: footprint of the robot.
             pose: pose of the base in map.
             margin: distance from the outline that counts as inside (m).
         """
@@ -109,35 +109,35 @@ class ZoneLayer:
                 yield shape, lowest
 
     def keepout_near(self, place: tuple[float, float], reach: float) -> Array:
-        """Boundary points of keepout zones within a square around a place, shape (n, 2), m."""
+        """Return the boundary points of keepout zones in a square around a place, shape (n, 2) (m)."""
         near = self.near(place, reach)
         return near.of(near.limits == 0.0).points
 
     def keepout_at(self, place: tuple[float, float]) -> str | None:
-        """Name of a keepout zone at a place in map (m); None if there is none."""
+        """Return the name of a keepout zone at a place in map (m); None without one."""
         at = np.array(place)
         return next((shape.zone.name for shape in self.shapes if float(shape.limits_at(at)) == 0.0), None)
 
     def outside(self, footprint: Footprint, pose: Pose2) -> "ZoneLayer":
-        """Layer without the keepout zones that a robot is in, whose boundaries do not enclose it."""
+        """Return the layer without the keepout zones that contain the robot, so that no boundary encloses it."""
         inside = {shape.zone.name for shape, limit in self.reached(footprint, pose) if limit == 0.0}
         return self if not inside else ZoneLayer([s.zone for s in self.shapes if s.zone.name not in inside], self)
 
     def keepout(self, footprint: Footprint, pose: Pose2, margin: float = 0.0) -> str | None:
-        """Name of a keepout zone that a footprint reaches into; None if it reaches into none."""
+        """Return the name of a keepout zone overlapped by a footprint; None without one."""
         reached = self.reached(footprint, pose, margin)
         return next((shape.zone.name for shape, limit in reached if limit == 0.0), None)
 
     def keepout_cells(
         self, shape: tuple[int, ...], resolution: float, origin: Pose2, margin: float
     ) -> NDArray[np.bool_]:
-        """Cells of a grid nearer than ``margin`` (m) to keepout zones. For workers: it loads scipy.
+        """Return the cells of a grid nearer than ``margin`` (m) to keepout zones. For workers: it loads scipy.
 
         Args:
             shape: rows and columns.
             resolution: side of a cell (m).
             origin: pose of the outer corner of cell (0, 0).
-            margin: m.
+            margin: minimum clearance (m).
 
         Returns:
             Shape (rows, columns).
@@ -166,12 +166,12 @@ class ZoneLayer:
 
 
 def in_force(zones: Zones) -> list[Zone]:
-    """Zones that are not off."""
+    """Return the enabled zones."""
     return [zone for zone in zones.zones if zone.off_until is None]
 
 
 def changed(newest: Zones | None, before: Zones | None) -> Zones | None:
-    """The newest message if its zones differ from those before; None if they are the same or none has come."""
+    """Return the latest message if its zones differ from the previous ones, else None."""
     same = newest is None or (before is not None and newest.zones == before.zones)
     return None if same else newest
 
@@ -180,8 +180,8 @@ def inside(points: Array, corners: Array) -> NDArray[np.bool_]:
     """Return which points lie inside a polygon, by the even-odd rule.
 
     Args:
-        points: points, shape (..., 2), m.
-        corners: corners of the polygon, shape (n, 2), m.
+        points: points, shape (..., 2) (m).
+        corners: corners of the polygon, shape (n, 2) (m).
 
     Returns:
         Shape (...,).
@@ -195,16 +195,16 @@ def inside(points: Array, corners: Array) -> NDArray[np.bool_]:
 
 
 def limits_of(mask: ZoneMask) -> Array:
-    """Maximum speed of each cell of a mask, shape (rows, columns), m/s; +inf without a limit."""
+    """Return the maximum speed of each cell of a mask, shape (rows, columns) (m/s); +inf without a limit."""
     levels, counts = np.array(mask.runs, np.intp).reshape(-1, 2).T
     return np.repeat(np.array((np.inf, *mask.limits))[levels], counts).reshape(mask.height, mask.width)
 
 
 def mask_of(limits: Array, resolution: float, origin: tuple[float, float]) -> ZoneMask | None:
-    """Mask of speed limits, without its margin of cells that have none; None if no cell has one.
+    """Return the mask of speed limits, trimmed to the cells with a limit; None without any.
 
     Args:
-        limits: shape (rows, columns), row 0 at the lowest y, m/s; +inf without a limit.
+        limits: limits, shape (rows, columns), row 0 at the lowest y (m/s); +inf without a limit.
         resolution: side of a cell (m).
         origin: x, y of the outer corner of cell (0, 0) (m).
     """
@@ -230,7 +230,7 @@ def mask_of(limits: Array, resolution: float, origin: tuple[float, float]) -> Zo
 
 
 def _along(corners: Array) -> Array:
-    """Points on the edges of a polygon, its corners included, shape (n, 2)."""
+    """Return points on the edges of a polygon including its corners, shape (n, 2)."""
     edges = []
     for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         count = max(math.ceil(math.dist(start, end) / SPACING), 1)
@@ -239,7 +239,7 @@ def _along(corners: Array) -> Array:
 
 
 def _edges(limits: Array, mask: ZoneMask) -> tuple[Array, Array]:
-    """Points on the edges between cells of different limits, shape (n, 2), and the lower limit at each, shape (n,)."""
+    """Return points on edges between cells of different limits, (n, 2), and the lower limit at each, (n,)."""
     padded = np.pad(limits, 1, constant_values=np.inf)
     res = mask.resolution
     count = math.ceil(res / SPACING)
