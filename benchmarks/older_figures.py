@@ -17,17 +17,22 @@ from typing import Final
 ROOT: Final = Path(__file__).resolve().parents[1]
 
 
+def git(*words: str) -> str:
+    """Return the output of a command of git in this repository."""
+    return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+
+
 @cache
 def _history() -> tuple[tuple[str, tuple[str, ...]], ...]:
-    """Return hash and changed paths of every commit, newest first."""
-    log = subprocess.run(
-        ["git", "log", "--format=%x00%H", "--name-only", "--no-renames"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    commits = (part.split("\n") for part in log.stdout.split("\0")[1:])
+    """Return hash and changed paths of every commit, newest first.
+
+    Raises:
+        LookupError: a shallow clone, whose oldest commit seems to change every file.
+    """
+    if git("rev-parse", "--is-shallow-repository") != "false\n":
+        raise LookupError("a shallow clone has no history")
+    log = git("log", "--format=%x00%H", "--name-only", "--no-renames")
+    commits = (part.split("\n") for part in log.split("\0")[1:])
     return tuple((lines[0], tuple(filter(None, lines[1:]))) for lines in commits)
 
 

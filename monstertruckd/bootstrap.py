@@ -235,7 +235,9 @@ def both(pytest: Path, wall: list[str], others: list[str]) -> int:
             other.terminate()
             other.wait()
             output.seek(0)
-            print(output.read().decode(errors="replace"), flush=True)
+            sys.stdout.flush()
+            shutil.copyfileobj(output, sys.stdout.buffer)  # whatever the encoding of the terminal
+            sys.stdout.flush()
     return retried(pytest, others, code) or retried(pytest, wall, wall_code)
 
 

@@ -6,6 +6,8 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
+import numpy as np
+
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError, TruckError
@@ -226,6 +228,7 @@ class Calibration:
 
 
 def _thinned(points: Any) -> list[list[float]]:
-    """At most 200 points, shape (n, 2), as a plot 300 pixels wide can show them; the last one is kept."""
+    """At most 200 finite points, shape (n, 2), as a plot 300 pixels wide can show them; the last one is kept."""
+    points = points[np.isfinite(points).all(axis=1)]
     step = -(-len(points) // 200)
     return [[float(f"{value:.5g}") for value in point] for point in points[::-1][::step][::-1]] if step else []

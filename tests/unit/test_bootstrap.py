@@ -228,7 +228,7 @@ def test_so_are_those_on_the_wall_clock_which_run_beside_the_others_and_are_show
     assert ran[1] == bootstrap.WALL
     assert ran[3] == (*bootstrap.WALL, *bootstrap.FAILED_ALONE)
     lines = [line.partition(" -")[0] for line in capfd.readouterr().out.splitlines()]
-    assert lines[-5:] == ["==> nice", "==> pytest", "those on the wall clock", "", "==> pytest"]
+    assert lines[-4:] == ["==> nice", "==> pytest", "those on the wall clock", "==> pytest"]
 
 
 def test_those_on_the_wall_clock_end_with_the_check(steps, monkeypatch: pytest.MonkeyPatch):

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.older_figures import commits_since, known
+from benchmarks.older_figures import commits_since
 from pages.markdown import Page, join, table
 
 DOCS = Path(__file__).resolve().parents[2]
@@ -75,21 +75,12 @@ def read(file: Path) -> Figures:
     try:
         found = json.loads(file.read_text(encoding="utf-8"))
         return Figures(
-            found["command"],
-            _known(found["commit"], file.stem),
-            found["machine"],
+            *(found[key] for key in ("command", "commit", "machine")),
             tuple(found["measures"]),
             *(found[key] for key in ("figures", "goals", "tables")),
         )
     except (KeyError, ValueError) as error:
         raise ValueError(f"{file.name}: {error!r}") from error
-
-
-def _known(commit: str, name: str) -> str:
-    try:
-        return known(commit, name)
-    except (OSError, LookupError, subprocess.CalledProcessError):
-        return commit  # no clone, or a shallow one
 
 
 def shown(markdown: str) -> str:
@@ -133,11 +124,12 @@ def stated(markdown: str) -> set[str]:
 
 def _blocks(markdown: str) -> Iterator[tuple[bool, str]]:
     """Yield each paragraph, and whether it shows results."""
-    measured = False
+    measured = 0  # level of the heading that a section of results has; 0 outside one
     for block in NOT_PROSE.sub(lambda found: found[0].replace("\n\n", "\n"), markdown).split("\n\n"):
-        if block.startswith("#"):
-            measured = MEASURED.match(block) is not None
-        yield measured or BENCHMARK.search(block) is not None, block
+        level = len(block) - len(block.lstrip("#"))
+        if level and (not measured or level <= measured):
+            measured = level if MEASURED.match(block) else 0
+        yield measured > 0 or BENCHMARK.search(block) is not None, block
 
 
 def _values(figures: Figures) -> list[list[str]]:

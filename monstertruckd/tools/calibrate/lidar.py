@@ -143,10 +143,10 @@ class LidarWizard:
         legs = []
         for move in self._moves(chassis):
             legs.append(LidarLeg.of(await context.move(move), chassis, mount))
-            seen = np.array([leg.seen[:2] for leg in legs])
-            context.plot(Plot("motion between rests by the scans", "ahead (m)", "to the left (m)", seen))
+            context.plot(_plot(legs))
         also = topics.SCAN, topics.ODOMETRY
         weaving = [await context.move(replace(move, also=also)) for move in weaves(1)]
+        context.plot(_plot(legs))
         crab = crab_error(context)
         offset = context.fit("offset of the clocks", lambda: time_offset(weaving))
         return context.fit("mount", lambda: result_of(legs, mount, crab, offset, level))
@@ -492,3 +492,8 @@ def _yaws(record: MoveRecord) -> tuple[Array, Array, Array, Array, Array] | None
     wheel = np.unwrap([o.pose.yaw for o in odometry])
     at = np.array(stamps, dtype=np.float64)
     return at, np.unwrap(yaws), np.interp(at, times, wheel), times, wheel
+
+
+def _plot(legs: Sequence[LidarLeg]) -> Plot:
+    seen = np.array([leg.seen[:2] for leg in legs])
+    return Plot("motion between rests by the scans", "ahead (m)", "to the left (m)", seen)

@@ -250,7 +250,7 @@ def export_command(
 def animate_command(
     log: LogArgument,
     output: Annotated[Path, typer.Argument(help="GIF file.", show_default=False)],
-    speed: Annotated[float, typer.Option(min=0.1, max=1000.0, help="Seconds of the log per frame.")] = 8.0,
+    speed: Annotated[float, typer.Option(min=0.1, max=1000.0, help="Seconds of the log per second.")] = 8.0,
     width: Annotated[int, typer.Option(min=64, max=1920, help="Pixels.")] = 560,
     json_output: JsonOption = False,
 ) -> None:

@@ -74,15 +74,17 @@ class ModelCommand(NumberCommand):
         """
         from pydantic import ValidationError
 
+        from monstertruck_schemas.base import first_mistake
+
         names = [parameter.name or "" for parameter in self._added or ()]
         ctx.obj = {name: given for name in names if (given := ctx.params.pop(name)) is not None}
         try:
             return super().invoke(ctx)
         except ValidationError as error:
-            detail = error.errors(include_url=False)[0]
-            where = "".join(f"--{key}: ".replace("_", "-") for key in detail["loc"] if key in names)
-            text = detail["msg"].removeprefix("Value error, ")
-            raise InputError(where + in_own_words(f": {text}").removeprefix(": ")) from error
+            key, _, text = first_mistake(error).rpartition(": ")
+            options = {one.name: one.opts[0] for one in self._added or ()}
+            where = options.get(key, key)
+            raise InputError((f"{where}: " if where else "") + in_own_words(f": {text}").removeprefix(": ")) from error
 
 
 def _with_parameters(parameters: list[inspect.Parameter]) -> Callable[..., None]:

@@ -59,6 +59,13 @@ def move(
     settings: dict[str, Any] = context.obj
     if "length" not in settings and "angle" not in settings:
         raise InputError("expected --length 0.5, or --radius 0 --angle 90, for example")
+    spot = settings.get("radius") == 0.0
+    for name in ("speed", "acceleration") if spot else ("turn_rate", "turn_acceleration"):
+        if name in settings:
+            right = ("--turn-rate", "--turn-acceleration") if spot else ("--speed", "--acceleration")
+            wrong = f"--{name.replace('_', '-')}"
+            motion = "a turn on the spot" if spot else "a move that is not a turn on the spot"
+            raise InputError(f"{wrong} does not apply to {motion}: expected {' or '.join(right)}")
     MoveConfig.model_validate(settings)
 
     async def main(client: "TruckClient", _: "Clock") -> "RunEnd":

@@ -58,8 +58,8 @@ async def run_behaviour(client: Operator, name: str, *, arm: bool, settings: Map
 async def run_exploration(
     client: TruckClient,
     *,
-    home: bool | None,
-    budget: float | None,
+    home: bool | None = None,
+    budget: float | None = None,
     find: int | None = None,
     arm: bool,
     report: Report | None = None,

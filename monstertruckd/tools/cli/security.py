@@ -123,7 +123,7 @@ def router(
         typer.Option("--address", "-a", help="Address or host name of the router; robots connect to the first."),
     ],
     place: Annotated[Path | None, typer.Option(help="Folder of these files on the router.")] = None,
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Address to listen on.")] = 7447,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port to listen on.")] = 7447,
     folder: Annotated[
         Path, typer.Option("--folder", "-f", help="Folder of the router's authority.", show_default=False)
     ] = Path("router-security"),

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.older_figures import latest_commit
+from benchmarks import older_figures
+from benchmarks.older_figures import known, latest_commit, rows
 from benchmarks.record import program, record, tables
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -93,10 +94,18 @@ def test_figures_older_than_their_code_are_shown_with_the_number_of_changes(figu
     assert found.source.endswith(f"{found.machine}.")
 
 
-def test_a_commit_that_a_rebase_replaced_is_the_latest_of_its_file(figures):
-    file = FILES[0]
-    assert figures.read(file).commit == figures.known(json.loads(file.read_text(encoding="utf-8"))["commit"], file.stem)
-    assert figures.known("no such commit", file.stem) == latest_commit(file)
+def test_a_commit_that_a_rebase_replaced_counts_as_the_latest_of_its_file():
+    (name, commit, _, _), *_ = rows()
+    assert known("no such commit", name) == latest_commit(ROOT / "docs" / "figures" / f"{name}.json")
+    assert known(known(commit, name), name) == known(commit, name)
+
+
+def test_a_shallow_clone_has_no_history(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(older_figures, "git", lambda *words: "true\n" if "rev-parse" in words else "\0abc\n\nREADME.md")
+    older_figures._history.cache_clear()
+    with pytest.raises(LookupError, match="shallow"):
+        older_figures.commits_since("abc", ["README.md"])
+    older_figures._history.cache_clear()
 
 
 def test_the_program_of_a_command_is_its_file():

@@ -45,7 +45,8 @@ class Wizards:
             self.cancelled = True
             raise
         panel.progress("drive", 0.5, 1.0)
-        panel.plot(Plot("scale", "input (V)", "meter (V)", np.linspace((0.0, 0.0), (300.0, 600.0), 301), np.eye(2)))
+        points = np.vstack((np.linspace((0.0, 0.0), (300.0, 600.0), 301), (1.0, np.nan)))
+        panel.plot(Plot("scale", "input (V)", "meter (V)", points, np.eye(2)))
 
         async def save() -> str:
             self.saved += 1

@@ -4,6 +4,7 @@ import asyncio
 from unittest.mock import AsyncMock
 
 import pytest
+from typer.testing import CliRunner
 
 from monstertruck_runtime.drives import TaskEnd, run_task
 from monstertruck_runtime.errors import InputError, NoAnswerError, RequestRefusedError
@@ -16,6 +17,7 @@ from monstertruck_schemas.req import ExploreOrder
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_schemas.topics import EVENT, EXPLORE, GATE
+from monstertruckd.tools.cli import goto, main, runs
 from monstertruckd.tools.cli.model_options import seconds_of
 from monstertruckd.tools.cli.runs import progress_line, run_exploration
 
@@ -226,3 +228,25 @@ def test_before_the_first_look_at_the_map_it_tells_no_zeros():
     starts = progress_line(state(3, ExplorationPhase.LOOKING))
     assert starts.endswith("waiting for the first analysis of the map")
     assert progress_line(state(3, ExplorationPhase.LOOKING, known=12.0)).endswith("looking")
+
+
+@pytest.mark.parametrize(
+    ("options", "asked"),
+    [([], {}), (["--home"], {"home": True}), (["--stay", "--budget", "20min"], {"home": False, "budget": 1200.0})],
+)
+def test_the_command_passes_the_options_that_are_given(monkeypatch: pytest.MonkeyPatch, options, asked):
+    ran = AsyncMock(side_effect=RequestRefusedError(Reason.BUSY, "another one runs"))
+    monkeypatch.setattr(goto, "require_section", AsyncMock())
+    monkeypatch.setattr(runs, "run_task", ran)
+    monkeypatch.setattr(goto, "with_robot", lambda main, *_: asyncio.run(main(robot, None)))
+    robot = Robot()
+    robot.explore = AsyncMock()
+    done = CliRunner().invoke(main.app, ["explore", *options])
+    assert isinstance(done.exception, RequestRefusedError | SystemExit), done.exception
+    asyncio.run(start(ran))
+    assert {key: value for key, value in robot.explore.call_args.kwargs.items() if value is not None} == asked
+
+
+async def start(ran: AsyncMock) -> None:
+    """Give the order that ``run_task`` was to give."""
+    await ran.call_args.args[3]()

@@ -23,6 +23,14 @@ from monstertruckd.tools.cli.runs import RunEnd
         (["--radius", "0", "--angle", "0"], "the length or angle is 0: the robot would not move"),
         (["--length", "1", "--speed", "-0.1"], "--speed: expected greater than 0"),
         (["--length", "1", "--bearing", "400"], "--bearing"),
+        (
+            ["--radius", "0", "--angle", "90", "--speed", "0.1"],
+            "--speed does not apply to a turn on the spot",
+        ),
+        (
+            ["--length", "1", "--turn-rate", "0.1"],
+            "--turn-rate does not apply to a move that is not a turn",
+        ),
     ],
 )
 def test_what_is_no_move_is_refused_at_once(options, said):
