@@ -27,27 +27,27 @@ Clock = Callable[[], float]
 
 
 TerrainWeights = tuple[float, float, float]
-"""Extra cost of a metre on unknown ground, for each radian of tilt, for each metre of roughness, m."""
+"""Extra costs (m): per metre on unknown ground, per radian of tilt, per metre of roughness."""
 
 
 class RouteCosts(NamedTuple):
-    """What ground costs a vehicle."""
+    """Ground costs of a vehicle."""
 
     terrain: TerrainWeights
     clearance: float
-    """Distance from the footprint's side to obstacles without extra cost, m."""
+    """Distance from the footprint's side to obstacles beyond which they cost nothing (m)."""
     clearance_cost: float
-    """Extra cost of a metre in contact, m."""
+    """Extra cost per metre in contact (m)."""
     closed: float
-    """Minimum distance of the vehicle's point to obstacles, m."""
+    """Minimum distance of the vehicle's point to obstacles (m)."""
     side: float
-    """Half the width of the footprint, m."""
+    """Half the width of the footprint (m)."""
     wide: float
-    """Distance to obstacles that leaves room for turning, m."""
+    """Distance to obstacles that leaves room for turning (m)."""
 
     @classmethod
     def of(cls, vehicle: "Vehicle", config: DriveCosts) -> "RouteCosts":
-        """Cost model of a vehicle, with the weights of a configuration."""
+        """Return the cost model of a vehicle with the weights of a configuration."""
         footprint = vehicle.footprint.data()
         side = footprint.half_width or footprint.radius
         return cls(
@@ -59,16 +59,16 @@ class RouteCosts(NamedTuple):
 
 @dataclass(frozen=True)
 class RouteMap:
-    """Map to plan on. Costs of its cells are computed when they are first requested, and kept.
+    """Map for planning; the costs of its cells are computed on first use and kept.
 
     Args:
-        field: obstacles.
-        unknown: shape of the field's grid, bool: unknown cells, which cost extra; None: none.
-        tilt: the same shape, rad, 0 where not known; None: level.
-        roughness: the same shape, m; None: smooth.
+        field: distance field of the obstacles.
+        unknown: mask of unknown cells, which cost extra, in the shape of the field's grid; None without any.
+        tilt: tilt in the same shape (rad), 0 where unknown; None for level ground.
+        roughness: roughness in the same shape (m); None for smooth ground.
 
     Raises:
-        InputError: a layer of another shape than the field.
+        InputError: a layer has another shape than the field.
     """
 
     field: DistanceField
@@ -76,9 +76,9 @@ class RouteMap:
     tilt: Array | None = None
     roughness: Array | None = None
     terrains: dict[TerrainWeights, NDArray[np.float32]] = attribute(default_factory=dict, init=False, repr=False)
-    """Computed so far: extra cost of a metre in each cell of the ringed grid."""
+    """Extra cost per metre in each cell of the ringed grid, as far as computed."""
     coarse: dict[RouteCosts, NDArray[np.int16]] = attribute(default_factory=dict, init=False, repr=False)
-    """Computed so far: see ``cell_costs``."""
+    """Result of ``cell_costs``, as far as computed."""
 
     def __post_init__(self) -> None:
         shape = tuple(n - 2 for n in self.field.data().occupied.shape)
@@ -95,8 +95,8 @@ class RouteMap:
     ) -> "RouteMap":  # fmt: skip
         """Map of cells (rows, columns), -1 unknown, 0 free to 100 occupied, row 0 at the lowest y.
 
-        ``previous`` is the map before: unchanged parts reuse its results. Nothing reverses onto
-        the cells ``unseen``.
+        ``previous`` is the last map, whose results are reused for unchanged parts. Routes never reverse onto the
+        ``unseen`` cells.
         """
         occupied = cells >= OCCUPIED
         missing = cells < 0
@@ -109,7 +109,7 @@ class RouteMap:
         return result
 
     def _take_over(self, previous: "RouteMap", changes: list[Box]) -> None:
-        """Costs of the map before, computed again where something differs."""
+        """Copy the costs of the last map, and recompute those that differ."""
         for name in ("unknown", "tilt", "roughness"):
             new, old = getattr(self, name), getattr(previous, name)
             if (new is None) != (old is None):
@@ -136,11 +136,11 @@ class RouteMap:
 
     @property
     def coarse_cell(self) -> float:
-        """Size of a coarse cell, m."""
+        """Size of a coarse cell (m)."""
         return self.coarse_factor * self.field.resolution
 
     def cost_layer(self, costs: RouteCosts) -> CostLayer:
-        """Extra costs in all cells."""
+        """Extra costs of all cells."""
         terrain = self.terrains.get(costs.terrain)
         if terrain is None:
             terrain = self.terrains[costs.terrain] = np.zeros(self._terrain_shape(costs.terrain), np.float32)
@@ -149,7 +149,7 @@ class RouteMap:
         return CostLayer(terrain, contact, costs.clearance, costs.clearance_cost)
 
     def cell_costs(self, costs: RouteCosts) -> NDArray[np.int16]:
-        """Cost of a straight step into each coarse cell, 0 = closed; read-only."""
+        """Cost of a straight step into each coarse cell, 0 for closed cells; read-only."""
         cells = self.coarse.get(costs)
         if cells is None:
             distance, factor = self.field.data().distance, self.coarse_factor
@@ -169,7 +169,7 @@ class RouteMap:
         return (rows, columns) if self._weighted_layers(weights) else (0, 0)
 
     def _fill_terrain(self, weights: TerrainWeights, terrain: NDArray[np.float32], box: Box) -> None:
-        """Write a box of the costs of the ground; the ring costs nothing."""
+        """Write a rectangle of the ground costs; the ring costs nothing."""
         top, left, bottom, right = (np.clip(v, 1, n - 1) for v, n in zip(box, 2 * terrain.shape, strict=True))
         if terrain.size:
             inner, outer = np.s_[top - 1 : bottom - 1, left - 1 : right - 1], np.s_[top:bottom, left:right]
@@ -181,11 +181,11 @@ class Vehicle:
     """Footprint and limits of the vehicle.
 
     Args:
-        footprint: relative to the reference point, as its ``offset`` or disc centres say.
-        radius: minimum turning radius of the reference point, m.
-        crab_angle: largest angle of a translation, rad; 0: cannot crab.
-        steering: mode of arcs and lines.
-        reference: x of the reference point in base, m.
+        footprint: footprint relative to the reference point.
+        radius: minimum turning radius of the reference point (m).
+        crab_angle: maximum angle of a translation (rad); 0 for a vehicle that cannot crab.
+        steering: steering mode of arcs and lines.
+        reference: x of the reference point in base (m).
     """
 
     footprint: Footprint | DiscFootprint
@@ -203,7 +203,7 @@ class Vehicle:
         geometry: FourWheelSteering | None = None,
         footprint: Footprint | None = None,
     ) -> "Vehicle":
-        """The truck: front steering about the rear axle, counter steering about the centre, or that and crab."""
+        """Return the truck with front steering (about the rear axle) or counter steering (about the centre)."""
         geometry, footprint = geometry or FourWheelSteering(), footprint or Footprint()
         if steering == "2ws":
             radius = geometry.minimum_radius("front", angle)
@@ -213,22 +213,22 @@ class Vehicle:
         return cls(footprint, geometry.minimum_radius("counter", angle), crab, "counter", 0.0)
 
     def reference_pose(self, base: ArrayLike) -> Array:
-        """Pose of the reference point for one of the base."""
+        """Return the pose of the reference point for a pose of the base."""
         return moved(np.asarray(base, dtype=np.float64), self.reference)
 
     def reeds_shepp(self, costs: DriveCosts | None = None) -> ReedsShepp:
-        """Obstacle-free motions, cheapest by the costs, or shortest."""
+        """Return the cheapest or the shortest obstacle-free motions."""
         weights = (costs.reverse_cost, costs.cusp_cost, costs.crab_cost) if costs else (1.0, 0.0, 1.0)
         return ReedsShepp(self.radius, self.crab_angle, *weights, self.steering, self.reference)
 
 
 class Budget:
-    """Limit of a planner: seconds, or an amount of work.
+    """Budget of a planner: a time in seconds, or an amount of work.
 
     Args:
-        seconds: from now on, if there is a clock.
-        now: the clock, s; of processor time, so that a busy computer does not shorten the search.
-        effort: nodes expanded and smoothing trials, if there is no clock.
+        seconds: time limit from now on, if there is a clock.
+        now: clock of processor time (s), so that a busy computer does not shorten the search.
+        effort: number of expanded nodes and smoothing trials, if there is no clock.
     """
 
     def __init__(self, seconds: float, now: Clock | None, effort: int) -> None:
@@ -240,27 +240,27 @@ class Budget:
 
     @property
     def elapsed(self) -> float:
-        """Seconds since the beginning; 0 without a clock."""
+        """Seconds since the start; 0 without a clock."""
         return self._now() - self._begin if self._now else 0.0
 
     def remaining(self) -> float:
-        """Share of the budget that remains, at most 1."""
+        """Remaining share of the budget, at most 1."""
         used = self.elapsed / self._seconds if self._now else self.work / self._effort
         return max(1.0 - used, 0.0)
 
 
 @dataclass(frozen=True)
 class RouteResult:
-    """A route, or the reason why there is none."""
+    """A route, or the reason for its absence."""
 
     reason: Reason
     path: MotionPath | None = None
     poses: Array | None = None
-    """Shape (n, 3): x, y, yaw of the reference point, from planners whose routes are not drivable motions."""
+    """Poses x, y, yaw of the reference point, shape (n, 3), from planners whose routes are not drivable motions."""
     cost: float = math.inf
-    """Metres, with all extra costs."""
+    """Cost including all extra costs (m)."""
     text: str = ""
-    """Detail of the reason."""
+    """Details of the reason."""
     statistics: dict[str, float] = attribute(default_factory=dict)
 
     @property
@@ -283,7 +283,7 @@ class RouteResult:
 
 
 class RoutePlanner(Protocol):
-    """Pure: the same arguments, without a clock, give the same result."""
+    """Route planner; without a clock, equal arguments give equal results."""
 
     @property
     def vehicle(self) -> Vehicle:
@@ -292,24 +292,24 @@ class RoutePlanner(Protocol):
 
     @property
     def config(self) -> GoalConfig:
-        """Settings it was made with."""
+        """Settings of the planner."""
         ...
 
     def plan(self, route_map: RouteMap, start: ArrayLike, goal: ArrayLike, now: Clock | None = None) -> RouteResult:
-        """Route between two poses (x, y, yaw) of the vehicle's reference point.
+        """Plan a route between two poses (x, y, yaw) of the vehicle's reference point.
 
         Args:
             route_map: obstacles and costs.
-            start: in the map's frame, m, rad.
-            goal: the same.
-            now: clock of the budget, s of processor time; None: the budget is an amount of work, and the result is
+            start: pose in the map's frame (m, m, rad).
+            goal: pose in the map's frame (m, m, rad).
+            now: clock of the budget (s of processor time); None: the budget is an amount of work, and the result is
                 reproducible.
         """
 
 
 @dataclass(frozen=True)
 class Endpoints:
-    """Start and goal that are free."""
+    """Free start and goal."""
 
     start: Array
     goal: Array
@@ -319,17 +319,17 @@ def check_endpoints(
     route_map: RouteMap, vehicle: Vehicle, start: ArrayLike, goal: ArrayLike, position: float, yaw: float,
     margin: float, *, start_margin: float | None = None,
 ) -> Endpoints | RouteResult:  # fmt: skip
-    """Free start and goal, the latter within tolerance, or the result that refuses them.
+    """Return free start and goal, the goal within its tolerance, or the result that refuses them.
 
     Args:
-        route_map: obstacles.
-        vehicle: its footprint counts.
+        route_map: map with the obstacles.
+        vehicle: vehicle with its footprint.
         start: pose of the reference point.
-        goal: the same.
-        position: tolerance of the goal, m.
-        yaw: the same, rad.
-        margin: to be kept at both, m.
-        start_margin: to be kept at the start instead, m.
+        goal: pose of the reference point.
+        position: tolerance of the goal's position (m).
+        yaw: tolerance of the goal's yaw (rad).
+        margin: clearance at both poses (m).
+        start_margin: clearance at the start instead (m).
     """
     try:
         a, b = (np.array(p, dtype=np.float64).reshape(3) for p in (start, goal))
@@ -352,14 +352,14 @@ def check_endpoints(
 
 
 def _refused(field: DistanceField, footprint: Footprint | DiscFootprint, pose: Array, margin: float) -> str:
-    """Why a pose that does not keep the margin is refused."""
+    """Return the reason for refusing a pose without the margin."""
     overlaps = not field.free(footprint, pose[None])[0]
     why = "the footprint overlaps an obstacle" if overlaps else f"an obstacle is closer than {margin:g} m"
     return f"{_format_pose(pose)}: {why}"
 
 
 def _tolerance_offsets(position: float, yaw: float) -> list[Array]:
-    """Small displacements within the tolerances, the smallest first."""
+    """Return small displacements within the tolerances, the smallest first."""
     around = [(0.0, 0.0)]
     around += [
         (s * position * math.cos(k), s * position * math.sin(k))
@@ -374,11 +374,11 @@ def _format_pose(pose: Array) -> str:
 
 
 def warm_up(planner: RoutePlanner) -> None:
-    """Plan on two small maps, so that numba compiles everything (or reads its cache) beforehand.
+    """Plan on two small maps, so that numba compiles everything (or loads its cache) beforehand.
 
-    The second one is the first with a wall whose gap is too narrow. The last route leaves the edge of the map.
+    The second map is the first one with a wall whose gap is too narrow. The last route leaves the edge of the map.
     """
-    # distance from the start of the last route of ``warm_up`` to the edge of the map, m: less than the margin
+    # distance from the start of the last route to the edge of the map, m: less than the margin
     warm_up_clearance = 0.02
     margin = max(planner.config.margin, 2 * warm_up_clearance)
     config = planner.config.model_copy(update={"effort": 6000, "margin": margin})  # see ``GoalConfig.effort``
@@ -398,9 +398,9 @@ def warm_up(planner: RoutePlanner) -> None:
 
 
 def make_planner(vehicle: Vehicle, config: GoalConfig) -> RoutePlanner:
-    """Route planner of a configuration.
+    """Build the route planner of a configuration.
 
     Raises:
-        InputError: settings without a kind of route planner, or a required package is not installed.
+        InputError: the settings name no kind of route planner, or a required package is not installed.
     """
     return cast("RoutePlanner", ROUTE_PLANNERS.build(config, vehicle, config))

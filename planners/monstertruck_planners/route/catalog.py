@@ -1,4 +1,4 @@
-"""The route planners by ``kind``."""
+"""Route planners by ``kind``."""
 
 from typing import Annotated, Final
 
@@ -30,7 +30,7 @@ ROUTE_PLANNERS: Final = Catalog(
     ),
     base=GoalConfig,
 )
-"""A route planner is made from the vehicle and its settings; it is a ``RoutePlanner``."""
+"""A route planner kind is built from the vehicle and its settings, and is a ``RoutePlanner``."""
 
 AnyRoutePlanner = Annotated[GoalConfig, ROUTE_PLANNERS.section()]
-"""The configuration's section `planner.route`."""
+"""Section `planner.route` of the configuration."""

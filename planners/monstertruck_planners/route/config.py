@@ -15,56 +15,56 @@ class GoalConfig(Schema):
     """Settings shared by all route planners."""
 
     budget: Positive = 1.0
-    """CPU time for a route and its improvement, s, with a clock."""
+    """CPU time for a route and its improvement, with a clock (s)."""
     effort: Annotated[int, Field(gt=0)] = 60_000
     """Maximum number of expanded nodes and smoothing trials without a clock: equal inputs then give equal routes."""
     position_tolerance: NotNegative = 0.05
-    """Maximum distance of an accepted free pose if the goal itself is not free, m."""
+    """Maximum distance of a free pose that replaces an occupied goal (m)."""
     yaw_tolerance: NotNegative = 0.09
-    """Heading tolerance at the goal, rad."""
+    """Heading tolerance at the goal (rad)."""
     margin: NotNegative = 0.0
-    """Margin between footprint and obstacles, m."""
+    """Margin between footprint and obstacles (m)."""
     unknown: Unknown = "blocked"
-    """Unknown cells are obstacles, free at an extra cost (``dear``), or free."""
+    """Treatment of unknown cells: obstacles, free at an extra cost (``dear``), or free."""
     unknown_cost: NotNegative = 1.0
-    """Extra cost per metre on unknown cells that are ``dear``, m."""
+    """Extra cost per metre on unknown cells that are ``dear`` (m)."""
 
 
 class DriveCosts(GoalConfig):
-    """Costs of drivable motions. With the defaults routes are nearly the shortest."""
+    """Costs of drivable motions; with the defaults, routes are nearly the shortest."""
 
     reverse_cost: AtLeastOne = 1.0
-    """Cost per metre backward, m; above 1 for a truck whose sensors look ahead."""
+    """Cost per metre backward (m); above 1 for a truck whose sensors look ahead."""
     cusp_cost: NotNegative = 0.1
-    """Cost of a change of direction, m."""
+    """Cost of a change of direction (m)."""
     free_cusps: Annotated[int, Field(ge=0)] = 4
-    """Changes of direction without an extra cost."""
+    """Number of changes of direction without an extra cost."""
     many_cusps_cost: NotNegative = 0.4
-    """Extra cost of each further change of direction, m: at each the truck stops and its errors add up."""
+    """Extra cost of each further change of direction (m), because the truck stops there and its errors add up."""
     swing_cost: NotNegative = 0.01
-    """Cost of a change of curvature, m: few long arcs instead of many short ones."""
+    """Cost of a change of curvature (m); it favours few long arcs over many short ones."""
     crab_cost: AtLeastOne = 1.0
-    """Cost per metre of translation, m."""
+    """Cost per metre of translation (m)."""
     clearance: NotNegative = 0.1
-    """Distance to obstacles below which motion costs more, m."""
+    """Distance to obstacles below which motion costs more (m)."""
     clearance_cost: NotNegative = 0.1
-    """Extra cost per metre in contact, falling to 0 at ``clearance``, m."""
+    """Extra cost per metre in contact (m), falling to 0 at ``clearance``."""
     tilt_cost: NotNegative = 2.0
-    """Extra cost per metre and radian of tilt, m."""
+    """Extra cost per metre and radian of tilt (m)."""
     roughness_cost: NotNegative = 100.0
-    """Extra cost per metre and metre of roughness, m."""
+    """Extra cost per metre and metre of roughness (m)."""
 
 
 class HybridConfig(DriveCosts):
-    """Hybrid A* with improvement until the budget is used up."""
+    """Hybrid A*, with improvement of the route until the budget is used up."""
 
     kind: Literal["hybrid"] = "hybrid"
     heuristic_weight: AtLeastOne = 2.0
-    """Heuristic weight: a greater weight finds a first route sooner."""
+    """Heuristic weight; a greater weight finds a first route sooner."""
     narrow_margin: NotNegative = 0.03
-    """Minimum margin, used if the configured margin leaves no path, m."""
+    """Minimum margin, used if no path keeps the configured one (m)."""
     improve: bool = True
-    """Smooth the route and try alternatives while there is time."""
+    """Smooth the route and try alternatives within the budget."""
 
 
 class LatticeConfig(DriveCosts):
@@ -72,15 +72,15 @@ class LatticeConfig(DriveCosts):
 
     kind: Literal["lattice"] = "lattice"
     cell: Positive = 0.05
-    """Cell size, m."""
+    """Cell size (m)."""
     turn_factor: AtLeastOne = 2.0
     """Cost factor of a turn forward."""
     reverse_factor: AtLeastOne = 3.0
     """Cost factor of a metre backward."""
     reverse_turn_factor: AtLeastOne = 5.0
-    """Cost factor of a turn or translation backward."""
+    """Cost factor of a turn or a translation backward."""
     heuristic_weight: AtLeastOne = 2.0
-    """Heuristic weight of the first search; it falls to 1 while there is time."""
+    """Heuristic weight of the first search; it falls to 1 within the budget."""
 
 
 class GridAstarConfig(GoalConfig):
@@ -94,6 +94,6 @@ class GridAstarConfig(GoalConfig):
     lethal: Positive = 200.0
     """Minimum costmap value of a closed cell."""
     inflation: NotNegative = 0.3
-    """Extent of obstacle costs beyond the inscribed circle, m."""
+    """Extent of obstacle costs beyond the inscribed circle (m)."""
     decay: Positive = 10.0
-    """Decay of the costs with distance, 1/m."""
+    """Decay of the costs with distance (1/m)."""

@@ -1,11 +1,12 @@
 """Corridors on the coarse grid: gaps too narrow for the footprint, and alternative paths. Loads numba.
 
-The cost to go treats the vehicle as a point with a radius, so it leads the search into gaps that a circle inside the
-footprint passes but the footprint does not. Checking every cell and heading of a map would take longer than the
-search: only cells on the paths in question are checked.
+The cost to go treats the vehicle as a point with a radius. It therefore leads the search into gaps wide enough for a
+circle inside the footprint, but not for the footprint. Checking every cell and heading of a map would take longer than
+the search, so only cells on the paths in question are checked.
 
-Alternatives to the shortest path (other homotopy classes) come from the sum of the cost to the goal and from the start,
-which is the cost of the shortest path over a cell: the cheapest cell far from all known paths leads to a new one.
+Alternatives to the shortest path (other homotopy classes) come from the sum of the costs to the goal and from the
+start, which is the cost of the shortest path over a cell. The cheapest cell far from all known paths leads to a new
+one.
 """
 
 from math import ceil, pi
@@ -22,10 +23,10 @@ from monstertruck_planners.route.heuristic import NEIGHBOURS, UNREACHED
 def footprint_fits(field: FieldData, footprint: FootprintData, margin: float, x: float, y: float) -> bool:
     """Whether the footprint is free at a position in any heading."""
     symmetric = abs(footprint.centre) < 1e-9 and abs(footprint.discs.sum()) < 1e-9
-    headings = 72  # checked in half a turn
+    headings = 72  # headings over half a turn
     count = (1 if symmetric else 2) * headings
     for k in range(count):
-        # 29: step between two headings tried in turn: neighbouring headings mostly give the same result
+        # 29: step between headings tried in sequence: neighbouring headings mostly give the same result
         if safe_distance(field, footprint, margin, x, y, (k * 29 % count) * pi / headings) >= 0.0:
             return True
     return False
@@ -65,23 +66,23 @@ def close_narrow_gaps(
     field: FieldData, footprint: FootprintData, margin: float, cell_cost: NDArray[np.int16], factor: int, wide: float,
     step: NDArray[np.int8], row: int, column: int, radius: float, checked: NDArray[np.bool_],
 ) -> int:  # fmt: skip
-    """Close the coarse cells round a path without room for the footprint.
+    """Close the coarse cells around a path that are too narrow for the footprint.
 
     Args:
         field: the fine grid.
         footprint: footprint of the vehicle.
-        margin: to keep, m.
-        cell_cost: of the coarse cells, 0 = closed, see ``heuristic.cell_costs``; changed in place.
-        factor: fine cells per coarse one, each way.
-        wide: cells further than this from obstacles are taken to be open, m.
+        margin: required clearance (m).
+        cell_cost: costs of the coarse cells, 0 for closed cells, see ``heuristic.cell_costs``; changed in place.
+        factor: fine cells per coarse cell in each direction.
+        wide: distance to obstacles beyond which cells are considered open (m).
         step: see ``CostToGo``.
         row: row of the cell where the path begins.
-        column: the same.
-        radius: cells this near to the path are checked, cells.
-        checked: cells already checked; changed in place.
+        column: column of the path's first cell.
+        radius: radius around the path in which cells are checked (cells).
+        checked: mask of checked cells; changed in place.
 
     Returns:
-        Number of cells closed.
+        Number of closed cells.
     """
     closed = 0
     rows, columns = cell_cost.shape
@@ -104,7 +105,7 @@ def close_narrow_gaps(
 
 @njit(cache=True)
 def _mark_disc(mask: NDArray[np.bool_], row: int, column: int, radius: float) -> None:
-    """Mark the cells around one."""
+    """Mark the cells around a cell."""
     rows, columns = mask.shape
     span = int(radius)
     for r in range(max(row - span, 0), min(row + span + 1, rows)):
@@ -115,7 +116,7 @@ def _mark_disc(mask: NDArray[np.bool_], row: int, column: int, radius: float) ->
 
 @njit(cache=True)
 def mark_corridor(mask: NDArray[np.bool_], step: NDArray[np.int8], row: int, column: int, radius: float) -> None:
-    """Mark the cells within ``radius`` cells of the path from one cell to where ``step`` ends."""
+    """Mark the cells within ``radius`` cells of the path from a cell along ``step``."""
     while True:
         _mark_disc(mask, row, column, radius)
         k = step[row, column]
@@ -129,7 +130,7 @@ def mark_corridor(mask: NDArray[np.bool_], step: NDArray[np.int8], row: int, col
 def cheapest_unmarked(
     to_goal: NDArray[np.int32], from_start: NDArray[np.int32], marked: NDArray[np.bool_], limit: int
 ) -> int:
-    """Flat index of the unmarked cell with the cheapest path over it; -1 if none costs at most ``limit``."""
+    """Return the flat index of the unmarked cell with the cheapest path over it; -1 if none costs at most ``limit``."""
     best, where = limit + 1, -1
     rows, columns = marked.shape
     for row in range(rows):

@@ -1,9 +1,9 @@
-"""Departure: first motions of a route whose start is nearer to an obstacle than the margin. Loads numba.
+"""Departure: first motions of a route that starts nearer to an obstacle than the margin. Loads numba.
 
-If the start does not keep the margin, a search finds nothing, as all its motions begin too near. So the route begins
-with few arcs and translations during which the footprint comes no nearer to anything, up to a pose that keeps the
-margin; the rest is planned as usual. If no such motion exists the footprint may come nearer once more without touching,
-like the end of a car that leaves a wall at its side: first by half of the available clearance.
+From a start without the margin a search finds nothing, because all its motions begin too near to the obstacle. The
+route therefore begins with a few arcs and translations along which the footprint comes no nearer to any obstacle, up to
+a pose that keeps the margin; the rest is planned as usual. If no such motion exists, the footprint may come nearer once
+without touching, like the end of a car that leaves a wall at its side: first by half of the available clearance.
 """
 
 import math
@@ -58,7 +58,7 @@ PLACE: Final = np.array([0.01, 0.01, 0.03])
 def _level(
     field: FieldData, footprint: FootprintData, x: float, y: float, yaw: float, guess: int, least: int, most: int
 ) -> int:
-    """Clearance of a pose in steps of LEVEL, up to ``most``, looked for from ``guess`` on; -1: below ``least``."""
+    """Return the clearance of a pose in steps of LEVEL, up to ``most``, starting at ``guess``; -1 below ``least``."""
     level = guess
     if safe_distance(field, footprint, level * LEVEL, x, y, yaw) >= 0.0:
         while level < most and safe_distance(field, footprint, (level + 1) * LEVEL, x, y, yaw) >= 0.0:
@@ -76,24 +76,24 @@ def _drive_off(
     field: FieldData, footprint: FootprintData, pose: Array, segment: Array, level: int, best: int, dip: int,
     wanted: int,
 ) -> tuple[float, int, int]:  # fmt: skip
-    """Drive a segment on and on, up to a pose with the wanted clearance.
+    """Extend a segment up to a pose with the wanted clearance.
 
     Args:
-        field: the grid.
+        field: distance field.
         footprint: footprint of the vehicle.
-        pose: where it begins, shape (3,).
-        segment: its sign, curvature and sideslip count.
+        pose: start of the segment, shape (3,).
+        segment: gives sign, curvature and sideslip.
         level: clearance of the pose, in steps of LEVEL.
-        best: greatest one so far.
-        dip: by how much it may fall below the best one.
+        best: maximum clearance so far.
+        dip: maximum fall below the best clearance.
         wanted: clearance that ends the motion.
 
     Returns:
-        Length that is free (not signed), m, the clearance there, and the greatest one so far.
+        Free length (unsigned, m), the clearance at its end, and the maximum clearance so far.
     """
     sign = 1.0 if segment[0] > 0.0 else -1.0
     free, known = 0.0, level
-    for k in range(1, int(1.0 / CHECK) + 1):  # greatest length of an arc, m
+    for k in range(1, int(1.0 / CHECK) + 1):  # maximum length of an arc, m
         x, y, yaw = advance(pose[0], pose[1], pose[2], sign * k * CHECK, segment[1], segment[2])
         now = _level(field, footprint, x, y, yaw, known, max(best - dip, 0), wanted)
         if now < 0 or (sign < 0.0 and unseen_distance(field, footprint, x, y, yaw) < 0.0):
@@ -108,19 +108,19 @@ def _drive_off(
 def _to_room(
     field: FieldData, footprint: FootprintData, start: Array, segments: Array, after: float, wanted: int
 ) -> tuple[float, int]:
-    """First place of a path with the wanted clearance again, and the fall of the clearance until then.
+    """Find the place from which a path has the wanted clearance, and the fall of the clearance before it.
 
     Args:
-        field: the grid.
+        field: distance field.
         footprint: footprint of the vehicle.
-        start: pose of the path, shape (3,).
+        start: initial pose of the path, shape (3,).
         segments: segments of the path, shape (n, 3).
-        after: nearer to the start than this it may have it and fall again, m.
+        after: distance from the start within which the wanted clearance may be lost again (m).
         wanted: clearance, in steps of LEVEL.
 
     Returns:
-        Metres from the start, -1 if the path touches something before or never has it; greatest fall of the clearance
-        below the best one so far, in steps of LEVEL.
+        Distance from the start (m), -1 if the path touches an obstacle earlier or never has the clearance; and the
+        maximum fall below the best clearance so far, in steps of LEVEL.
     """
     x, y, yaw = start[0], start[1], start[2]
     level = _level(field, footprint, x, y, yaw, 0, 0, wanted)
@@ -148,13 +148,13 @@ class Departure:
     """Motions from a start to a pose that keeps the margin."""
 
     segments: Array
-    """Shape (n, 3), see ``motion``."""
+    """Segments, shape (n, 3), see ``motion``."""
     end: Array
-    """Pose of the reference point, shape (3,)."""
+    """Final pose of the reference point, shape (3,)."""
     cost: float
     """Cost (m)."""
     turns: bool
-    """Whether a search may turn the vehicle or move it sideways there; else it can only continue straight."""
+    """Whether a search may turn the vehicle or move it sideways there; otherwise it must continue straight."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,29 +168,29 @@ class _Node:
 
 @dataclass(frozen=True, slots=True)
 class Departures:
-    """Paths from a start to poses that keep the margin with a little to spare."""
+    """Departures from a start to poses that keep the margin with a small reserve."""
 
     found: list[Departure]
-    """Departures; those with an end where a search can turn come first, then the cheapest."""
+    """Departures; first those from whose end a search can turn, then the others, each by cost."""
     exhausted: bool
-    """Whether these are all departures; else the budget ended the search for them."""
+    """Whether the list is complete; otherwise the budget has ended the search."""
 
 
 def departures(
     route_map: RouteMap, vehicle: Vehicle, start: Array, config: DriveCosts, budget: Budget, reserve: float = 0.0
 ) -> Departures:
-    """Paths from a start to poses that keep the margin.
+    """Return departures from a start to poses that keep the margin.
 
     Args:
-        route_map: obstacles.
+        route_map: map with the obstacles.
         vehicle: the vehicle.
         start: pose of the reference point, shape (3,).
-        config: margin, and cost of a metre backward.
+        config: margin, and cost per metre backward.
         budget: budget of the route; includes this work.
-        reserve: share of it that is kept; of the rest half is kept for the route.
+        reserve: share of the budget to keep; half of the rest is kept for the route.
 
     Returns:
-        None found if the start touches an obstacle, or all its motions do.
+        No departures if the start or all its motions touch an obstacle.
     """
     field, footprint = route_map.field.data(), vehicle.footprint.data()
     wanted = _wanted(config.margin)
@@ -199,7 +199,7 @@ def departures(
         return Departures([], exhausted=True)
     straight, exhausted, end = list[Departure](), True, 0.5 * (budget.remaining() + reserve)
     # (0.0, 0.125, 0.5, 1.0): permitted relative falls of the clearance during a departure, tried in turn, each with
-    # half of the budget left
+    # half of the remaining budget
     dips = list(dict.fromkeys(math.ceil(level * share) for share in (0.0, 0.125, 0.5, 1.0)))
     for dip in dips:
         until = end if dip == dips[-1] else 0.5 * (budget.remaining() + end)
@@ -212,15 +212,15 @@ def departures(
 
 def _wanted(margin: float) -> int:
     """Return the clearance at the end, in steps of LEVEL."""
-    # Extra margin at the end of a departure (m): the first motion of a search may come a little nearer.
+    # Extra margin at the end of a departure (m), because the first motion of a search may come a little nearer.
     return int(np.ceil((margin + CHECK_MARGIN + 0.002) / LEVEL))
 
 
 def _arcs(vehicle: Vehicle) -> list[Array]:
-    """Segments of one metre, forward and backward: lines, arcs to both sides, translations to both sides."""
+    """Return segments of one metre, forward and backward: lines, arcs and translations to both sides."""
     shapes = [(share * side / vehicle.radius, 0.0) for share in CURVATURES for side in ((1, -1) if share else (1,))]
     if vehicle.crab_angle > 0.0:
-        # (1.0, 0.5): angles of the translations tried, as shares of the greatest one
+        # (1.0, 0.5): angles of the tried translations, as shares of the maximum angle
         shapes += [(0.0, share * side * vehicle.crab_angle) for share in (1.0, 0.5) for side in (1, -1)]
     return [np.array([sign, *shape]) for shape in shapes for sign in (1.0, -1.0)]
 
@@ -229,7 +229,7 @@ def _search(
     field: FieldData, footprint: FootprintData, vehicle: Vehicle, start: _Node, dip: int, config: DriveCosts,
     budget: Budget, until: float,
 ) -> Departures:  # fmt: skip
-    """Best first over arcs and the places on them, while more than ``until`` of the budget remains."""
+    """Search best first over arcs and the places on them, while more than ``until`` of the budget remains."""
     margin, reverse = config.margin, config.reverse_cost
     arcs, wanted, most = _arcs(vehicle), _wanted(margin), np.inf
     lines = [arc for arc in arcs if not arc[1:].any()]
@@ -238,13 +238,13 @@ def _search(
     number = count()
 
     def wait(node: _Node) -> None:
-        # 3.0: metres to drive for a metre of clearance, about: translations of 0.33 rad
+        # 3.0: approximate distance driven per metre of clearance: translations of 0.33 rad
         heappush(waiting, (node.cost + 3.0 * LEVEL * (wanted - node.level), next(number), node))
 
     wait(start)
     seen: set[tuple[int, ...]] = set()
     found: list[Departure] = []
-    enough, exhausted = 20, True  # departures from whose ends a route is searched, at most
+    enough, exhausted = 20, True  # maximum number of departures from whose ends a route is searched
     while waiting and enough > 0:
         _, _, node = heappop(waiting)
         place = tuple(np.round(node.pose / PLACE).astype(int).tolist())
@@ -268,21 +268,21 @@ def _search(
                 found.append(Departure(np.array(after.segments), after.pose, after.cost, turns))
             if turns:
                 enough -= 1
-                # 0.5: a departure is of no use if it costs so much more than the cheapest, m
+                # 0.5: maximum extra cost of a useful departure over the cheapest one, m
                 most = min(most, after.cost + 0.5)
             else:
                 wait(after)
-        # 60: checked poses that take as long as a node of a search, the unit of a planner's budget
+        # 60: number of checked poses equivalent to one node of a search, the unit of a planner's budget
         budget.work += checked // 60
     order = sorted(found, key=lambda departure: (not departure.turns, departure.cost))
     return Departures(order, exhausted=exhausted)
 
 
 def _sets_off(field: FieldData, footprint: FootprintData, arcs: list[Array], pose: Array, margin: float) -> bool:
-    """Whether a search with that margin may begin with one of some arcs."""
+    """Whether a search with this margin can begin with any of the arcs."""
     x, y, yaw = pose.tolist()
     keep = margin + CHECK_MARGIN
-    # 0.15: minimum free length of an arc from the end of a departure, m: else a search would end there
+    # 0.15: minimum free length of an arc after a departure, m: otherwise a search would end there
     return any(
         segment_free(field, footprint, keep, CHECK_STEP, x, y, yaw, 0.15 * sign, curvature, sideslip)
         for sign, curvature, sideslip in (arc.tolist() for arc in arcs)
@@ -290,7 +290,7 @@ def _sets_off(field: FieldData, footprint: FootprintData, arcs: list[Array], pos
 
 
 def _after(node: _Node, arc: Array, travelled: float, level: int, best: int, reverse: float) -> _Node:
-    """The node at the end of an arc of so many metres."""
+    """Return the node at the given length of an arc (m)."""
     segment = (float(arc[0]) * travelled, float(arc[1]), float(arc[2]))
     cusp = bool(node.segments) and node.segments[-1][0] * segment[0] < 0.0
     cost = node.cost + travelled * (1.0 if arc[0] > 0.0 else reverse) + 0.1 * cusp  # cost of a change of direction, m
@@ -303,19 +303,19 @@ def plan_between(
     route_map: RouteMap, vehicle: Vehicle, config: DriveCosts, start: ArrayLike, goal: ArrayLike,
     search: Callable[[Endpoints], RouteResult], budget: Budget, *, reserve: float = 0.0, departs: bool = True,
 ) -> RouteResult:  # fmt: skip
-    """Route between two poses, with a departure first if the start is too near to an obstacle; or why there is none.
+    """Return a route between two poses, with a departure if the start is too near to an obstacle, or the failure.
 
     Args:
-        route_map: obstacles and costs.
-        vehicle: what is driven.
+        route_map: map with obstacles and costs.
+        vehicle: vehicle to drive.
         config: margin, tolerances, costs.
         start: pose of the reference point.
-        goal: the same.
-        search: route between two poses that keep the margin; ``statistics["exhausted"]`` is not 0 if no budget would
-            help it.
+        goal: pose of the reference point.
+        search: plans between two poses that keep the margin; ``statistics["exhausted"]`` is not 0 if no budget would
+            help.
         budget: budget of the search, for the departure too.
-        reserve: share of it that is kept, see ``departures``.
-        departs: else there are no departures, and the start has to keep the margin.
+        reserve: share of the budget to keep, see ``departures``.
+        departs: whether departures are allowed; otherwise the start must keep the margin.
     """
     ends = _ends(route_map, vehicle, config, start, goal)
     if not departs:
@@ -361,9 +361,9 @@ def _ends(
 
 
 def needs_departure(route_map: RouteMap, vehicle: Vehicle, start: Array, margin: float) -> bool:
-    """Whether routes from a start may begin with a departure: elsewhere they keep the margin all the way."""
-    # 0.03: a start with less than this beyond the margin may be left by no motion of a search, m: the end of a body
-    # that turns comes that much nearer to a wall at its side
+    """Whether routes from a start may begin with a departure; otherwise they keep the margin throughout."""
+    # 0.03: minimum reserve beyond the margin at a start without a departure, m: the end of a turning body comes that
+    # much nearer to a wall at its side
     return not _room(route_map, vehicle, start, margin + 0.03)
 
 
@@ -380,19 +380,19 @@ class Leaving:
 def leaving(
     route_map: RouteMap, vehicle: Vehicle, path: MotionPath, margin: float, free: Callable[[MotionPath], bool]
 ) -> Leaving | None:
-    """How a path gets from its start to where it keeps the margin up to its end; None if it touches or never does.
+    """Return how a path leaves its start for the margin; None if it touches an obstacle or never keeps the margin.
 
     Args:
-        route_map: obstacles.
-        vehicle: what is driven.
+        route_map: map with the obstacles.
+        vehicle: vehicle to drive.
         path: path of the reference point.
-        margin: to obstacles, m.
+        margin: clearance from obstacles (m).
         free: whether a path keeps the margin.
     """
     field, footprint = route_map.field.data(), vehicle.footprint.data()
     start, segments = path.copied()
     kept, length = math.ceil((margin + CHECK_MARGIN) / LEVEL), 0.0
-    while length < 3.0:  # greatest length of a departure, m
+    while length < 3.0:  # maximum length of a departure, m
         length, fall = _to_room(field, footprint, start, segments, length, kept)
         if length < 0.0:
             break
@@ -403,14 +403,14 @@ def leaving(
 
 
 def _room(route_map: RouteMap, vehicle: Vehicle, start: Array, margin: float) -> bool:
-    """Whether a search with that margin has motions to begin with: others begin too near to an obstacle."""
+    """Whether a search with this margin has any first motion; without one, all begin too near to an obstacle."""
     return bool(route_map.field.free(vehicle.footprint, start[None], margin + CHECK_MARGIN)[0])
 
 
 def _best(
     found: list[Departure], route_map: RouteMap, vehicle: Vehicle, config: DriveCosts, goal: Array
 ) -> list[Departure]:
-    """The departures to begin with, ordered by the remaining path from their ends; no two end at one place."""
+    """Return the departures to use, ordered by the remaining path from their ends; no two end at one place."""
     if not found or not route_map.field.inside(goal[:2]):
         return found[:1]
     field, cell = route_map.field.data(), route_map.coarse_cell

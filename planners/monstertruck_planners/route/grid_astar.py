@@ -1,9 +1,9 @@
-"""The author's first planner: the cheapest path over a grid with inflated obstacles, for a point. Loads numba.
+"""The author's first planner: the cheapest path of a point over a grid with inflated obstacles. Loads numba.
 
-Costs as on the author's robot: neutral 50 for every cell, plus three times the costmap's value; cells from 200 up are
-closed; the value falls with distance beyond the inscribed circle as exp(-10 d), to 0.3 m. Headings point along the
-path. The result is not a drivable motion: turning radius and footprint are ignored. So a start need only be free: the
-tracker has to leave obstacles that are too near.
+Costs as on the author's robot: 50 per cell, plus three times the costmap's value; cells from 200 up are closed; beyond
+the inscribed circle the value falls with the distance d as exp(-10 d), up to 0.3 m. Headings point along the path. The
+result is not a drivable motion: turning radius and footprint are ignored. The start therefore only has to be free; the
+tracker must leave obstacles that are too near.
 """
 
 import numpy as np
@@ -17,10 +17,10 @@ from monstertruck_schemas.reasons import Reason
 
 
 class GridAstarPlanner:
-    """Ways over the grid for one vehicle.
+    """Grid paths for one vehicle.
 
     Args:
-        vehicle: its inscribed circle inflates the obstacles.
+        vehicle: vehicle whose inscribed circle inflates the obstacles.
         config: costs.
     """
 
@@ -29,7 +29,7 @@ class GridAstarPlanner:
         self.config = config or GridAstarConfig()
 
     def plan(self, route_map: RouteMap, start: ArrayLike, goal: ArrayLike, now: Clock | None = None) -> RouteResult:
-        """Shortest path between two poses; ``poses`` of the result, one for each cell."""
+        """Return the shortest path between two poses, one of the ``poses`` per cell."""
         config = self.config
         budget = Budget(config.budget, now, config.effort)
         ends = check_endpoints(
@@ -67,7 +67,7 @@ class GridAstarPlanner:
 
 
 def _headed(points: Array, start: Array, goal: Array) -> Array:
-    """Poses along points, from the exact start to the exact goal."""
+    """Return poses along points, from the exact start to the exact goal."""
     points = np.vstack((start[:2], points[1:-1], goal[:2]))
     ahead = np.diff(points, axis=0)
     return np.column_stack((points, np.concatenate(([start[2]], np.arctan2(ahead[1:, 1], ahead[1:, 0]), [goal[2]]))))

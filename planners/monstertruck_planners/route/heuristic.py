@@ -1,11 +1,11 @@
 """Heuristics of the searches: cost-to-go on a coarse grid, and length of the obstacle-free motion. Loads numba.
 
-The first is the shortest path around the obstacles for a point. A coarse cell is open if any cell inside it may hold
-the centre of the footprint; distance near obstacles costs more, because the vehicle is not a point. Every cell stores
-its successor, which the analytic expansions follow.
+The first heuristic is the shortest path of a point around the obstacles. A coarse cell is open if any cell inside it
+may hold the centre of the footprint; distance near obstacles costs more, because the vehicle is not a point. Every cell
+stores its successor, which the analytic expansions follow.
 
-The second is the length of the best motion without obstacles (Reeds-Shepp, with translations), tabulated around the
-goal in turning radii, so that one table serves every radius.
+The second heuristic is the length of the best motion without obstacles (Reeds-Shepp, with translations), tabulated
+around the goal in turning radii, so that one table serves every radius.
 """
 
 from functools import lru_cache
@@ -32,11 +32,11 @@ NEIGHBOURS = np.array([[1, 0], [1, 1], [0, 1], [-1, 1], [-1, 0], [-1, -1], [0, -
 
 
 TABLE_REACH = 4.0
-"""Half size of the Reeds-Shepp table, turning radii."""
+"""Half size of the Reeds-Shepp table (turning radii)."""
 
 
 OVERRUN = 1.3
-"""The cost to go is computed where the path from start to goal over a cell costs at most this times the shortest."""
+"""Cost-to-go is computed for cells if the path over them costs at most this factor times the shortest."""
 
 
 USED, WAITING, LEVEL, LIMIT = 0, 1, 2, 3
@@ -60,7 +60,7 @@ class CostToGo(NamedTuple):
     cell: float
     """Cell size (m)."""
     start: tuple[int, int]
-    """Row and column that the estimates lead to."""
+    """Target row and column of the estimates."""
     least: int
     """Minimum cost of a straight step; 0: no estimates, all directions are searched equally."""
     head: NDArray[np.int32]
@@ -94,10 +94,10 @@ def fill_cell_costs(
 
     Args:
         distance: distance of the fine grid with its ring, m.
-        layer: its extra costs.
-        rule: see above.
-        box: coarse cells that are written.
-        result: shape of the coarse grid, receives the costs; 0 = closed.
+        layer: layer of extra costs.
+        rule: cost rule.
+        box: coarse cells to write.
+        result: costs in the shape of the coarse grid, 0 for closed cells; written in place.
     """
     rows, columns = distance.shape
     factor = rule.factor
@@ -117,7 +117,7 @@ def fill_cell_costs(
             cost = 4.0
             if best >= rule.side:
                 cost = 1.0 + 0.5 * max(rule.wide - float(best), 0.0) / (rule.wide - rule.side)
-            # 7.0: greatest cost of a cell as a factor on UNIT: keeps within the buckets
+            # 7.0: maximum cost of a cell as a factor on UNIT, within the range of the buckets
             result[row, column] = int(UNIT * min(cost * (1.0 + extra), 7.0))
 
 
@@ -125,15 +125,15 @@ def cost_to_go(
     cell_cost: NDArray[np.int16], cell: float, goal: tuple[int, int], start: tuple[int, int],
     least: int = UNIT, overrun: float = OVERRUN,
 ) -> CostToGo:  # fmt: skip
-    """Paths from the start, and from cells round the path, to the goal; both are cells of the grid.
+    """Find paths from the start, and from cells around its path, to the goal; both are cells of the grid.
 
     Args:
         cell_cost: see ``CostToGo``.
-        cell: m.
+        cell: cell size (m).
         goal: row and column.
-        start: the same.
+        start: row and column.
         least: see ``CostToGo``.
-        overrun: see ``OVERRUN``; inf: all cells.
+        overrun: see ``OVERRUN``; inf for all cells.
     """
     rows, columns = cell_cost.shape
     most = 8 * rows * columns + 1
@@ -156,7 +156,7 @@ def cost_to_go(
 
 @njit(cache=True)
 def _estimate(to_go: CostToGo, row: int, column: int) -> int:
-    """Minimum cost from a cell to the start, without obstacles."""
+    """Return the minimum cost from a cell to the start, without obstacles."""
     across, along = abs(column - to_go.start[1]), abs(row - to_go.start[0])
     few, many = min(across, along), max(across, along)
     return to_go.least * (many - few) + to_go.least * 141 // 100 * few
@@ -164,7 +164,7 @@ def _estimate(to_go: CostToGo, row: int, column: int) -> int:
 
 @njit(cache=True)
 def cost_at(to_go: CostToGo, row: int, column: int) -> int:
-    """Cost from a cell of the grid to the goal, in 1/UNIT cells; UNREACHED where no path is known."""
+    """Return the cost from a cell to the goal, in 1/UNIT cells; UNREACHED without a known path."""
     if to_go.cell_cost[row, column] == 0 and to_go.cost[row, column] > 0:
         return UNREACHED
     while to_go.cost[row, column] + _estimate(to_go, row, column) > to_go.state[LEVEL]:
@@ -225,7 +225,7 @@ def _settle_level(to_go: CostToGo) -> None:
 
 @njit(cache=True)
 def cell_at(field: FieldData, cell: float, x: float, y: float) -> tuple[int, int]:
-    """(row, column) of the coarse cell at a point; outside the grid too."""
+    """Return the (row, column) of the coarse cell at a point, also outside the grid."""
     dx, dy = x - field.x, y - field.y
     return (
         int(np.floor((dy * field.cos - dx * field.sin) / cell)),
@@ -235,7 +235,7 @@ def cell_at(field: FieldData, cell: float, x: float, y: float) -> tuple[int, int
 
 @njit(cache=True)
 def cell_ahead(step: NDArray[np.int8], row: int, column: int, length: float) -> tuple[int, int]:
-    """Cell reached after ``length`` cells along the path to the goal, or the goal cell."""
+    """Return the cell after ``length`` cells along the path to the goal, or the goal cell."""
     while length > 0.0:
         k = step[row, column]
         if k < 0:
@@ -248,7 +248,7 @@ def cell_ahead(step: NDArray[np.int8], row: int, column: int, length: float) -> 
 
 @njit(cache=True)
 def cells_to_goal(step: NDArray[np.int8], row: int, column: int) -> NDArray[np.int64]:
-    """All cells (row, column) from one to the goal, shape (n, 2)."""
+    """Return all cells (row, column) from a cell to the goal, shape (n, 2)."""
     cells = np.empty((step.size, 2), np.int64)
     used = 0
     while True:
@@ -281,9 +281,9 @@ def _fill_table(crab: float) -> NDArray[np.float32]:
 
 @lru_cache(maxsize=8)
 def reeds_shepp_table(crab: float) -> NDArray[np.float32]:
-    """Lengths from the origin in turning radii, shape (x from -TABLE_REACH, y from 0, heading from 0).
+    """Return the lengths from the origin in turning radii, shape (x from -TABLE_REACH, y from 0, heading from 0).
 
-    The half of negative y is its mirror image.
+    The half with negative y is its mirror image.
     """
     return np.asarray(_fill_table(crab))
 
@@ -292,9 +292,9 @@ def reeds_shepp_table(crab: float) -> NDArray[np.float32]:
 def _reeds_shepp_length(
     table: NDArray[np.float32], radius: float, x: float, y: float, yaw: float, goal: Array
 ) -> float:
-    """Length in metres from a pose to the goal, at the nearest entry; the straight distance beyond the table."""
+    """Return the length from a pose to the goal (m), at the nearest entry; the straight distance beyond the table."""
     dx, dy = (x - goal[0]) / radius, (y - goal[1]) / radius
-    # The path back is as long: seen from the goal.
+    # The reverse path has the same length, so look up the pose from the goal.
     c, s = cos(goal[2]), sin(goal[2])
     px, py, turn = dx * c + dy * s, dy * c - dx * s, yaw - goal[2]
     if abs(px) > TABLE_REACH or abs(py) > TABLE_REACH:
@@ -311,7 +311,7 @@ def heuristic_cost(
     field: FieldData, to_go: CostToGo, table: NDArray[np.float32], radius: float, goal: Array,
     x: float, y: float, yaw: float,
 ) -> float:  # fmt: skip
-    """The greater of both heuristics, m; inf where no path to the goal is known."""
+    """Return the maximum of both heuristics (m); inf without a known path to the goal."""
     row, column = cell_at(field, to_go.cell, x, y)
     rows, columns = to_go.cost.shape
     if not (0 <= row < rows and 0 <= column < columns):

@@ -1,9 +1,9 @@
-"""The main route planner: Hybrid-A* for a first route, then path smoothing and alternatives while there is time.
+"""Main route planner: Hybrid A* for a first route, then smoothing and alternatives within the budget.
 
-Hybrid-A* is a search over poses grown by motion primitives, guided by two heuristics. Besides the primitives a node
-tries analytic expansions: the best obstacle-free motion to the goal, and to poses further along the cost-to-go path, so
-that open ground is crossed in few nodes. Source: D. Dolgov and others, "Practical search techniques in path planning
-for autonomous driving", 2008. Loads numba.
+Hybrid A* searches over poses reached by motion primitives, guided by two heuristics. At a node it also tries analytic
+expansions: the best obstacle-free motion to the goal, and to poses further along the cost-to-go path, which cross open
+ground in few nodes. Source: D. Dolgov and others, "Practical search techniques in path planning for autonomous
+driving", 2008. Loads numba.
 """
 
 import math
@@ -70,19 +70,21 @@ from monstertruck_schemas.plan import MAX_RUNS
 from monstertruck_schemas.reasons import Reason
 
 EXPANSION = -1
-"""Action of a node reached by an analytic expansion; others are numbers of primitives, and after these of the arcs of
-least radius among them, driven as far as they are free."""
+"""Action of a node reached by an analytic expansion. Other actions:
+
+numbers of primitives, followed by the primitives' tightest arcs, driven as far as they are free.
+"""
 
 
 MAX_NODES = 400_000
-"""Nodes of one search at most."""
+"""Maximum number of nodes in a search."""
 
 MAX_TABLE_CELLS = 1 << 26
-"""Cells of one search: a table of 256 MB; only visited parts take memory."""
+"""Maximum number of cells in a search: a table of 256 MB, of which only visited parts use memory."""
 
 
 FIRST_NODES = 512
-"""Nodes of the coarse search before gaps are measured and the fine search alternates with it."""
+"""Number of nodes in the coarse search before gaps are measured, and the fine search alternates with it."""
 
 
 NO_SEGMENTS = np.empty((0, 3))
@@ -102,18 +104,18 @@ class Nodes(NamedTuple):
     parent: IntArray
     action: IntArray
     direction: Array
-    """+1 or -1: direction at the end; 0 at the start."""
+    """Direction at the end, +1 or -1; 0 at the start."""
     cusps: IntArray
-    """Cusps from the start on."""
+    """Number of cusps since the start."""
     closed: NDArray[np.bool_]
     keys: Array
     items: IntArray
-    """The heap of open nodes."""
+    """Heap of open nodes."""
     table: NDArray[np.int32]
-    """Shape (rows, columns, headings): number of the node in each cell plus one, 0 for none."""
+    """One plus the number of the node in each cell, shape (rows, columns, headings); 0 for none."""
     cell: float
     counts: IntArray
-    """Used nodes, open nodes, nodes expanded so far."""
+    """Numbers of used nodes, open nodes, and expanded nodes."""
 
 
 USED, OPEN, EXPANDED = 0, 1, 2
@@ -125,7 +127,7 @@ def _open_node(
     heuristic_weight: float, x: float, y: float, yaw: float, cost: float, parent: int, action: int, direction: float,
     cusps: int,
 ) -> None:  # fmt: skip
-    """Put a pose on the open list if it is the cheapest in its cell and the goal can be reached from there."""
+    """Add a pose to the open list if it is the cheapest in its cell and the goal is reachable from it."""
     if nodes.counts[USED] >= len(nodes.cost) or cusps > model.max_cusps:
         return
     left = heuristic_cost(field, to_go, table, model.radius, goal, x, y, yaw)
@@ -154,7 +156,7 @@ def _open_node(
 def _expansion_target(
     field: FieldData, to_go: CostToGo, x: float, y: float, distance: float, look_ahead: float, target: Array
 ) -> bool:
-    """Pose ``distance`` metres along the cost-to-go path, facing along it; False if the goal is nearer."""
+    """Write the pose ``distance`` metres along the cost-to-go path, facing along it; False if the goal is nearer."""
     row, column = cell_at(field, to_go.cell, x, y)
     row, column = cell_ahead(to_go.step, row, column, distance / to_go.cell)
     ahead_row, ahead_column = cell_ahead(to_go.step, row, column, look_ahead / to_go.cell)
@@ -175,20 +177,20 @@ def expand(
     """Expand up to ``count`` nodes.
 
     Args:
-        field: the grid.
+        field: distance field.
         footprint: footprint of the vehicle.
-        layer: extra costs.
+        layer: layer of extra costs.
         to_go: cost-to-go.
         table: see ``reeds_shepp_table``.
         model: limits, costs and primitives of the vehicle.
-        goal: shape (3,).
-        nodes: memory.
+        goal: goal pose, shape (3,).
+        nodes: memory of the search.
         heuristic_weight: factor on the heuristics.
-        goal_range: expansions to the goal are tried from this near, m.
-        count: see above.
+        goal_range: maximum distance for expansions to the goal (m).
+        count: maximum number of nodes to expand.
 
     Returns:
-        RUNNING, FOUND or EXHAUSTED; if FOUND the segments from start to goal, else none.
+        RUNNING, FOUND or EXHAUSTED; and the segments from start to goal if FOUND, else none.
     """
     segments, best, scratch, target = np.empty((MAX_SEGMENTS, 3)), np.empty(8), np.empty((4, 3)), np.empty(3)
     primitive, nothing = np.empty((1, 3)), np.empty((0, 3))
@@ -244,7 +246,7 @@ def expand(
 def _write_primitive(
     field: FieldData, footprint: FootprintData, model: VehicleMotions, pose: Array, action: int, out: Array
 ) -> None:
-    """Segment of an action from a pose: a primitive, or an arc driven as far as it is free (length 0: none)."""
+    """Return the segment of an action from a pose: a primitive, or an arc as far as it is free (length 0: none)."""
     count = len(model.primitives)
     for k in range(3):
         out[k] = model.primitives[action % count, k]
@@ -260,7 +262,7 @@ def _write_primitive(
 def _trace(
     field: FieldData, footprint: FootprintData, model: VehicleMotions, goal: Array, nodes: Nodes, last_node: int
 ) -> Array:
-    """Segments from the start over a node to the goal, with a direct motion from the node."""
+    """Return the segments from the start over a node to the goal, with a direct motion from the node."""
     segments, best, scratch = np.empty((MAX_SEGMENTS, 3)), np.empty(8), np.empty((4, 3))
     depth, n = 1, last_node
     while nodes.parent[n] >= 0:
@@ -291,20 +293,20 @@ def _trace(
 
 @dataclass(frozen=True)
 class Resolution:
-    """Size of the search's cells, and length of its primitives."""
+    """Resolution of a search: cell size and length of the primitives."""
 
     cell: float
-    """Size of a cell, in turning radii."""
+    """Cell size (turning radii)."""
     primitive: float
-    """Length of a primitive, in turning radii."""
+    """Length of a primitive (turning radii)."""
     headings: int = 36
 
     def fitted(self, field: FieldData, radius: float) -> "Resolution":
-        """This resolution, or on a map too large for it a coarser one.
+        """Return this resolution, or a coarser one for a map that is too large for it.
 
         Args:
-            field: the map.
-            radius: turning radius, m.
+            field: distance field of the map.
+            radius: turning radius (m).
         """
         cells = field.occupied.size * (field.resolution / (self.cell * radius)) ** 2 * self.headings
         factor = max(math.sqrt(cells / MAX_TABLE_CELLS), 1.0)
@@ -312,7 +314,7 @@ class Resolution:
 
 
 RESOLUTIONS = (Resolution(0.35, 0.55), Resolution(0.15, 0.25), Resolution(0.06, 0.1, 72))
-"""The second one is for narrow places, where the first finds nothing soon; the third where that is exhausted."""
+"""The second resolution is for narrow places, after a failed first search; the third follows an exhausted one."""
 
 
 @dataclass(frozen=True)
@@ -327,13 +329,13 @@ class SearchProblem:
     """Poses, shape (3,)."""
     heuristic_weight: float
     budget: Budget
-    """Counts the nodes expanded."""
+    """Budget of the expanded nodes."""
     statistics: dict[str, float]
-    """The same, under "expanded"."""
+    """Statistics; the same number as "expanded"."""
 
 
 class SearchRun:
-    """One search, which can be interrupted and continued.
+    """A search that can be interrupted and continued.
 
     Args:
         problem: search problem.
@@ -357,7 +359,7 @@ class SearchRun:
         """Expand about ``count`` more nodes, while more than ``reserve`` of the budget is left.
 
         Returns:
-            Segments from start to goal, if they were found.
+            Segments from start to goal; None until they are found.
         """
         problem, nodes = self._problem, self._nodes
         first = int(nodes.counts[EXPANDED])
@@ -378,7 +380,7 @@ class SearchRun:
 
 
 def _allocate(field: FieldData, cell: float, headings: int, start: Array) -> Nodes:
-    """Memory for the nodes of a search; the start is the first."""
+    """Return the memory of a search, with the start as its first node."""
     n = MAX_NODES
     rows, columns = (int(count * field.resolution / cell) + 1 for count in field.occupied.shape)
     nodes = Nodes(
@@ -397,7 +399,7 @@ class MarginAttempt:
     """Planning with one of several margins."""
 
     reserve: float
-    """Share of the budget kept for the others."""
+    """Share of the budget kept for the other margins."""
     first: bool
 
 
@@ -407,7 +409,8 @@ class HybridPlanner:
     Args:
         vehicle: kinematics and footprint.
         config: costs, tolerances, budget.
-        departs: begin with a departure where the start is nearer to an obstacle than the margin; else refuse it.
+        departs: whether routes begin with a departure if the start is nearer to an obstacle than the margin; otherwise
+            such a start is refused.
     """
 
     def __init__(self, vehicle: Vehicle, config: HybridConfig | None = None, *, departs: bool = True) -> None:
@@ -420,7 +423,7 @@ class HybridPlanner:
         self._narrower = [HybridPlanner(vehicle, narrow, departs=departs) for narrow in narrower_configs(self.config)]
 
     def plan(self, route_map: RouteMap, start: ArrayLike, goal: ArrayLike, now: Clock | None = None) -> RouteResult:
-        """Route of the vehicle's reference point, see ``RoutePlanner``; ``statistics["margin"]`` is the margin kept."""
+        """Plan a route of the vehicle's reference point; ``statistics["margin"]`` is its margin."""
         budget = Budget(self.config.budget, now, self.config.effort)
         planners, share = [self, *self._narrower], 1.0
         for planner in planners:
@@ -434,7 +437,7 @@ class HybridPlanner:
     def plan_with_margin(
         self, budget: Budget, route_map: RouteMap, start: ArrayLike, goal: ArrayLike, attempt: MarginAttempt
     ) -> RouteResult:
-        """Route with the margin of this planner's settings, see ``plan``."""
+        """Plan a route with the margin of this planner's settings, see ``plan``."""
         return plan_between(
             route_map,
             self.vehicle,
@@ -448,13 +451,13 @@ class HybridPlanner:
         )
 
     def planner_for(self, margin: float) -> "HybridPlanner":
-        """The planner of the greatest margin that is not above this one, or of the narrowest."""
+        """Return the planner with the largest margin up to this one, or else with the smallest."""
         planners = [self, *self._narrower]
         return next((planner for planner in planners if planner.config.margin <= margin), planners[-1])
 
     @property
     def tolerance(self) -> float:
-        """Maximum deviation of a route's end from the goal, m and rad."""
+        """Maximum deviation of a route's end from the goal (m, rad)."""
         return max(self.config.position_tolerance, self.config.yaw_tolerance)
 
     def free(self, route_map: RouteMap, path: MotionPath) -> bool:
@@ -464,17 +467,17 @@ class HybridPlanner:
         return bool(segments_free(field, self.footprint, model, start, segments, len(segments)))
 
     def leaving(self, route_map: RouteMap, path: MotionPath) -> Leaving | None:
-        """The part of a path before it keeps the margin up to its end; None: it never does."""
+        """Return the part of a path before it keeps the margin up to its end; None if it never does."""
         return leaving(route_map, self.vehicle, path, self.config.margin, lambda rest: self.free(route_map, rest))
 
     def cost(self, route_map: RouteMap, path: MotionPath) -> float:
-        """Cost of a path, m."""
+        """Return the cost of a path (m)."""
         start, segments = path.copied()
         field, layer = route_map.field.data(), route_map.cost_layer(self.costs)
         return float(route_cost(field, layer, self.motion_model(RESOLUTIONS[0], 0.0), start, segments))
 
     def motion_model(self, resolution: Resolution, crab: float) -> VehicleMotions:
-        """The vehicle's limits and costs, with motion primitives of a resolution and translations up to an angle."""
+        """Return limits and costs of the vehicle, with primitives of a resolution and translations up to an angle."""
         key = (resolution, crab)
         if key not in self._models:
             self._models[key] = self._motion_model(resolution, crab)
@@ -495,18 +498,18 @@ class HybridPlanner:
 
 
 def holds_translations(segments: Array) -> bool:
-    """Whether some of a route's segments are driven at an angle to the heading."""
+    """Whether any of a route's segments is driven at an angle to the heading."""
     return bool((segments[:, 2] != 0.0).any())
 
 
 def narrower_configs(config: HybridConfig) -> list[HybridConfig]:
-    """Settings with the margins to try after ``config``'s margin."""
+    """Return the settings with the margins to try after ``config``'s margin."""
     spare = config.margin - config.narrow_margin
     if spare <= 0.0:
         return []
-    # 0.005: step from one margin tried to the next, m
+    # 0.005: step between tried margins, m
     margins = np.linspace(config.margin, config.narrow_margin, math.ceil(spare / 0.005 - 1e-6) + 1)[1:].tolist()
-    # 1.0: clearance cost of routes with a narrower margin: they use it only where they have to, m
+    # 1.0: clearance cost of routes with a narrower margin, which they then use only where necessary, m
     cost = max(config.clearance_cost, 1.0)
     return [config.model_copy(update={"margin": m, "narrow_margin": m, "clearance_cost": cost}) for m in margins]
 
@@ -556,7 +559,7 @@ class _PlanningRun:
 
     @cached_property
     def cell_cost(self) -> NDArray[np.int16]:
-        """Cost of entering each coarse cell; narrow gaps are closed here."""
+        """Cost of entering each coarse cell; narrow gaps are closed in it."""
         return self.route_map.cell_costs(self.planner.costs).copy()
 
     def _cost_to_go(self, cell_cost: NDArray[np.int16] | None = None, overrun: float = OVERRUN) -> CostToGo:
@@ -564,33 +567,33 @@ class _PlanningRun:
         return cost_to_go(cell_cost, self.cell, self._cell_of(self.goal), self._cell_of(self.start), overrun=overrun)
 
     def _first_route(self, crabs: tuple[float, ...], reserve: float) -> tuple[Array | None, Reason, str]:
-        """The direct motion without translations, or the result of the searches with these crab angles."""
+        """Return the direct motion without translations, or the result of the searches with these crab angles."""
         segments = self._direct(0.0)
         return self._search(self._cost_to_go(), crabs, reserve) if segments is None else (segments, Reason.OK, "")
 
     def _direct(self, crab: float) -> Array | None:
-        """The best motion without obstacles, with translations up to an angle, if it is free."""
+        """Return the best obstacle-free motion with translations up to an angle, if no obstacle touches it."""
         reeds_shepp = replace(self.planner.reeds_shepp, crab_angle=crab)
         _, segments = reeds_shepp.path(self.start, self.goal).copied()
         free = segments_free(self.field, self.footprint, self.model, self.start, segments, len(segments))
         return segments if free else None
 
     def _is_cheapest(self, segments: Array) -> bool:
-        """Whether nothing could make the best motion without obstacles cheaper: they and the ground cost nothing.
+        """Whether the best obstacle-free motion is optimal: neither obstacles nor ground add to its cost.
 
-        Backward metres that cost more may be avoided by longer arcs than such motions have.
+        If metres backward cost more, longer arcs than such a motion has may avoid them.
         """
         free = route_cost(self.field, NO_COSTS, self.model, self.start, segments)
         shortest = self.config.reverse_cost == 1.0 or segments[:, 0].min(initial=0.0) >= 0.0
         return shortest and self._cost(segments) <= free
 
     def _search(self, to_go: CostToGo, crabs: tuple[float, ...], reserve: float) -> tuple[Array | None, Reason, str]:
-        """First route: a short coarse search, then gaps are measured, and fine and coarse ones take turns.
+        """Find a first route: a coarse search, then closing of narrow gaps, then fine and coarse searches in turn.
 
         Args:
             to_go: cost-to-go.
-            crabs: greatest angles of translations that are searched with, in this order.
-            reserve: share of the budget that is kept.
+            crabs: maximum angles of translations, in the order of the searches.
+            reserve: share of the budget to keep.
         """
         width = 2 * (self.planner.costs.side + self._gap_margin)
         too_narrow = None, Reason.GOAL_UNREACHABLE, f"no passage {width:.2f} m wide leads there"
@@ -612,7 +615,7 @@ class _PlanningRun:
             segments = fine[0].run(MAX_NODES, reserve)
         if segments is not None:
             return segments, Reason.OK, ""
-        # A search that is exhausted proves nothing: between its cells and headings there may be a path.
+        # An exhausted search proves nothing: there may be a path between its cells and headings.
         self.statistics["exhausted"] = float(fine[-1].exhausted)
         return (
             None,
@@ -635,7 +638,7 @@ class _PlanningRun:
         return SearchRun(self.problem, model, to_go, resolution, goal_range)
 
     def _run_in_turns(self, fine: list[SearchRun], coarse: list[SearchRun], reserve: float) -> Array | None:
-        """Result of the first of several searches that finds a route; each is a fine and a coarse one."""
+        """Return the result of the first of several search pairs (fine and coarse) that finds a route."""
         count = FIRST_NODES
         while self.budget.remaining() > reserve and not fine[-1].exhausted:
             for pair in zip(fine, coarse, strict=True):
@@ -643,7 +646,7 @@ class _PlanningRun:
                     segments = run.run(count, reserve)
                     if segments is not None:
                         return segments
-            count *= 2  # growth of the nodes expanded per turn, from one round to the next
+            count *= 2  # growth of the number of expanded nodes per turn, from round to round
         return None
 
     def _reachable(self, to_go: CostToGo) -> bool:
@@ -651,18 +654,18 @@ class _PlanningRun:
 
     @property
     def _gap_margin(self) -> float:
-        """Clearance needed on both sides of a gap, m; without a margin, the search decides about the tightest gaps."""
-        gap_error = 0.01  # error of the positions and headings checked against the best ones, m
-        # 0.005: width needed in a gap beyond the margin on both sides, m: with less no search finds a path through it
+        """Clearance needed on both sides of a gap (m); without a margin, narrow gaps stay open."""
+        gap_error = 0.01  # error of the checked positions and headings against the best ones, m
+        # 0.005: width needed in a gap beyond both margins, m: in a narrower gap no search finds a path
         return self.config.margin + (0.005 if self.config.margin >= gap_error else -gap_error)
 
     def _close_narrow_gaps(self, to_go: CostToGo) -> bool:
-        """Close the narrow gaps on the shortest path, then on the next one around them, and so on; False: none."""
+        """Close the narrow gaps on the shortest path, then on the next one around them, etc.; False without a path."""
         checked = np.zeros(self.cell_cost.shape, np.bool_)
-        # 0.06: a cell nearer to obstacles than this plus half the footprint's width may belong to a narrow gap, m
+        # 0.06: maximum distance of a narrow gap's cell from obstacles beyond half the footprint's width, m
         wide = self.planner.costs.side + self.config.margin + 0.06
         any_closed = False
-        for _ in range(30):  # paths checked for narrow gaps, at most
+        for _ in range(30):  # maximum number of paths checked for narrow gaps
             for width in (0.0, 0.15 / self.cell):  # width checked on both sides of a path with a narrow gap, m
                 closed = close_narrow_gaps(
                     self.field, self.footprint, self._gap_margin, self.cell_cost, self.factor, wide, to_go.step,
@@ -677,14 +680,15 @@ class _PlanningRun:
         return any_closed
 
     def _improve(self, first: Array) -> Array:
-        """Best route within the remaining budget.
+        """Return the best route within the remaining budget.
 
-        Motions without translations are found in half the time: they come first, as for a vehicle that has no others,
-        and their result is kept unless translations make it shorter at no higher cost. So these make no route longer.
+        Motions without translations are found in half the time. They come first, as for a vehicle without translations,
+        and their result is kept unless translations make it shorter at no higher cost. Translations therefore never
+        make a route longer.
         """
         segments = first
         if holds_translations(first):
-            # 0.5: share of the budget kept when a route without translations is searched and one with them is known
+            # 0.5: share of the budget kept for smoothing once a route is known
             plain, _, _ = self._first_route((0.0,), 0.5)
             segments = first if plain is None else plain
         segments = self._with_fewer_cusps(segments)
@@ -699,14 +703,14 @@ class _PlanningRun:
         return segments
 
     def _detours(self, segments: Array) -> tuple[int, float]:
-        """Cusps that cost extra; weighted metres."""
+        """Return the number of cusps with an extra cost (weighted metres)."""
         backward, _, crab = self.model.weights
         metres = np.abs(segments[:, 0]) * np.where(segments[:, 0] < 0.0, backward, 1.0)
         metres *= np.where(segments[:, 2] != 0.0, crab, 1.0)
         return max(cusps_of(segments) - self.config.free_cusps, 0), float(metres.sum())
 
     def _with_fewer_cusps(self, segments: Array) -> Array:
-        """The route, or one with fewer cusps if it has so many that each costs extra."""
+        """Return the route, or a cheaper one with fewer cusps if it has cusps with extra costs."""
         crabs = (0.0, self.crab) if holds_translations(segments) else (0.0,)
         while (cusps := cusps_of(segments)) > self.config.free_cusps:
             to_go = self._cost_to_go()
@@ -714,7 +718,7 @@ class _PlanningRun:
                 [self._search_run(to_go, RESOLUTIONS[k], crab, max_cusps=cusps - 1, strokes=True) for crab in crabs]
                 for k in (1, 0)
             )
-            # 0.3: share of the budget kept when routes with fewer cusps are searched
+            # 0.3: share of the budget kept during the search for routes with fewer cusps
             other = self._run_in_turns(fine, coarse, 0.3)
             if other is None:
                 break
@@ -722,7 +726,7 @@ class _PlanningRun:
         return segments
 
     def _improve_in_rounds(self, segments: Array) -> Array:
-        """Smooth the best route and alternatives in turn until nothing improves or only the last share is left."""
+        """Smooth the best route and alternatives in turn, until nothing improves or only the last share is left."""
         others = self._starts(segments)
         cheapest = next(others)  # along the cheapest path, while the first route may lead straight ahead
         if len(cheapest) and self._cost(cheapest) < self._cost(segments):
@@ -731,12 +735,12 @@ class _PlanningRun:
             others = chain([cheapest], others)
         best, cost = self._smoothed(segments, NO_SEGMENTS, np.inf)
         idle = 0
-        # 0.2: share of the budget for the final smoothing without and then with translations
-        # 12: maximum rounds of smoothing without gain
+        # 0.2: share of the budget for the final smoothing without and then with translations 12: maximum rounds of
+        # smoothing without gain
         while self.budget.remaining() > 0.2 and idle < 12:
             segments = next(others)
             mate = best if len(segments) else NO_SEGMENTS
-            # 1.1: maximum cost of another route that is smoothed further, as a factor of the best cost
+            # 1.1: maximum cost of another route that is smoothed further, as a factor on the best cost
             segments, other = self._smoothed(segments if len(segments) else best, mate, 1.1 * cost)
             idle = 0 if other < 0.9995 * cost else idle + 1
             if other < cost:
@@ -744,7 +748,7 @@ class _PlanningRun:
         return best
 
     def _starts(self, first: Array) -> Iterator[Array]:
-        """Routes to smooth: the alternatives; then by turns the best route (None) and each of these again."""
+        """Yield the routes to smooth: the alternatives, then the best route (None) alternating with each of them."""
         found = [first]
         for segments in self._alternatives():
             if len(segments):
@@ -756,14 +760,14 @@ class _PlanningRun:
                 yield segments
 
     def _polished(self, segments: Array) -> Array:
-        """The route smoothed in ever smaller steps."""
+        """Smooth the route in ever smaller steps."""
         path = editable(self.start, segments)
         for shift in (0.25, 0.1, 0.03, 0.01):  # shifts of poses in the final smoothing, as fractions of a stretch
             self._shortcut(path, 1e-4, shift)
         return current_segments(path).copy()
 
     def _smoothed(self, segments: Array, mate: Array, promising: float) -> tuple[Array, float]:
-        """Shortcuts, the best of it and its mate, shortcuts again; only the first unless the cost is ``promising``."""
+        """Take shortcuts, chain the route with its mate, take shortcuts again; only the first unless ``promising``."""
         path = editable(self.start, segments)
         self._shortcut(path)
         cost = self._cost(current_segments(path))
@@ -777,9 +781,9 @@ class _PlanningRun:
         return segments, self._cost(segments)
 
     def _shortcut(self, path: SegmentBuffer, gain: float = 1e-3, shift: float = 0.25) -> None:
-        """Shortcut trials until a batch gains less than a share of the cost."""
+        """Try shortcuts until the gain of a batch falls below a share of the cost."""
         last, reach = np.inf, 40.0 * self.vehicle.radius
-        batch = 1000  # smoothing trials between two checks of the budget
+        batch = 1000  # number of smoothing trials between two checks of the budget
         while self.budget.remaining() > 0.0 and (cost := self._cost(current_segments(path))) < (1.0 - gain) * last:
             last, random = cost, self.random.random((batch, 6))
             kept = shortcut(self.field, self.footprint, self.layer, self.model, path, reach, shift, random)
@@ -791,14 +795,14 @@ class _PlanningRun:
         return float(route_cost(self.field, self.layer, self.model, self.start, segments))
 
     def _best_chain(self, routes: list[Array]) -> Array:
-        """Motions over places of several routes, ordered by their share of the length, with the best headings."""
+        """Chain motions over places of several routes, ordered by their share of the length, with the best headings."""
         paths = [MotionPath(self.start, route) for route in routes if len(route)]
         length = paths[0].length
         spacing = max(1.5 * self.vehicle.radius, length / 60) * self.random.uniform(0.7, 1.3)
         samples = [path.sample(spacing) for path in paths]
         poses = np.vstack([sample.poses for sample in samples])
         travelled = np.concatenate([length / path.length * s.travelled for path, s in zip(paths, samples, strict=True)])
-        # The first route's start and end are the chain's.
+        # The chain starts and ends like the first route.
         last = len(samples[0].poses) - 1
         by_travelled = np.argsort(travelled, kind="stable")
         inner = by_travelled[(travelled[by_travelled] > 1e-6) & (travelled[by_travelled] < length - 1e-6)]
@@ -809,7 +813,7 @@ class _PlanningRun:
         )
 
     def _alternatives(self) -> Iterator[Array]:
-        """First routes along all alternatives to the shortest path, the shortest first."""
+        """Yield first routes along all alternatives to the shortest path, the shortest first."""
         to_go = self._cost_to_go()
         columns = self.cell_cost.shape[1]
         start, goal = self._cell_of(self.start), self._cell_of(self.goal)
@@ -817,9 +821,9 @@ class _PlanningRun:
         for ways in (to_go, from_start):
             complete(ways)
         known = np.zeros(self.cell_cost.shape, np.bool_)
-        # 2.5: least distance of an alternative from all known routes, at one place at least, turning radii
+        # 2.5: minimum distance of an alternative from all known routes at one place, turning radii
         width = 2.5 * self.vehicle.radius / self.cell
-        # 1.15: maximum length of alternatives, as a factor of the shortest path
+        # 1.15: maximum length of alternatives, as a factor on the shortest path
         limit = int(1.15 * to_go.cost[start])
         while (cell := cheapest_unmarked(to_go.cost, from_start.cost, known, limit)) >= 0:
             corridor = np.zeros(self.cell_cost.shape, np.bool_)
@@ -827,7 +831,7 @@ class _PlanningRun:
                 mark_corridor(corridor, step, cell // columns, cell % columns, width)
                 mark_corridor(known, step, cell // columns, cell % columns, width)
             self.statistics["alternatives"] += 1
-            # From further off the expansion to the goal is not tried: it would leave the corridor.
+            # From further away, an expansion to the goal would leave the corridor.
             near = 3.0 * self.vehicle.radius
             inside = self._cost_to_go(np.where(corridor, self.cell_cost, np.int16(0)))
             segments = self._search_run(inside, RESOLUTIONS[0], 0.0, near).run(CHUNK)

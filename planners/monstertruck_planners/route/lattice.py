@@ -1,9 +1,9 @@
-"""State-lattice planner: A* over cells and headings, repeated with a smaller heuristic weight while there is time.
+"""State-lattice planner: A* over cells and headings, repeated with a smaller heuristic weight within the budget.
 
-Cells and headings are exact; the goal is reached by one obstacle-free motion. There are 16 headings, along the grid's
-short vectors. A turn to the next heading is line, arc, line with the largest radius that fits, and of all cells it
-could end at that with the shortest turn is taken. The primitives are computed for each vehicle: stored sets that keep
-their cells when the cell size changes turn tighter than the car.
+Cells and headings are exact; one obstacle-free motion reaches the goal. There are 16 headings, along the grid's short
+vectors. A turn to the next heading is line, arc, line with the largest radius that fits; the shortest turn is chosen
+among all cells that it could end at. The primitives are computed for each vehicle, because stored sets that keep their
+cells at another cell size would turn tighter than the car.
 
 Loads numba.
 """
@@ -65,21 +65,21 @@ VECTORS = (
 ANGLES = np.array([math.atan2(y, x) for x, y in VECTORS])
 HEADINGS = len(VECTORS)
 LONG_PRIMITIVE = 8
-"""Cells of the long straight primitive, about."""
+"""Approximate length of the long straight primitive (cells)."""
 MAX_PRIMITIVE_SEGMENTS = 3
 
 
 class Primitives(NamedTuple):
-    """The motion primitives by the heading they start at."""
+    """Motion primitives by initial heading."""
 
     segments: Array
-    """Shape (headings, k, 3, 3): up to three segments each, unused ones of length 0."""
+    """Up to three segments per primitive, shape (headings, k, 3, 3); unused ones have length 0."""
     shift: IntArray
-    """Shape (headings, k, 3): columns, rows and headings moved on."""
+    """Displacements in columns, rows and headings, shape (headings, k, 3)."""
     cost: Array
-    """Shape (headings, k), m."""
+    """Costs, shape (headings, k) (m)."""
     used: IntArray
-    """Shape (headings,): number of primitives."""
+    """Number of primitives, shape (headings,)."""
 
 
 def make_primitives(
@@ -88,10 +88,10 @@ def make_primitives(
     """Motion primitives of one vehicle.
 
     Args:
-        radius: least turning radius, m.
-        crab_angle: largest angle of a translation, rad; 0: none.
-        cell: m.
-        factors: on the cost of a turn forward, a line backward, a turn or translation backward.
+        radius: minimum turning radius (m).
+        crab_angle: maximum angle of a translation (rad); 0 for none.
+        cell: cell size (m).
+        factors: cost factors of a turn forward, a line backward, a turn or translation backward.
     """
     table = [_primitives_from(h, radius, crab_angle, cell, factors) for h in range(len(VECTORS))]
     most = max(map(len, table))
@@ -124,7 +124,7 @@ def _primitives_from(
         length = sum(abs(piece[0]) for piece in pieces)
         primitives.append((pieces, (dx, dy, turn), turn_factor * length))
     for turn in (1, -1):
-        # Backward into the next heading: a turn from there, driven back.
+        # Backward into the next heading: a turn from there, driven in reverse.
         pieces, (dx, dy) = _turn((h + turn) % HEADINGS, -turn, radius, cell)
         length = sum(abs(piece[0]) for piece in pieces)
         back = [(-s, k, b) for s, k, b in reversed(pieces)]
@@ -138,7 +138,7 @@ def _primitives_from(
 
 
 def _turn(h: int, turn: int, radius: float, cell: float) -> tuple[list[_Segment], tuple[int, int]]:
-    """Shortest turn to the next heading that ends on a cell, with the largest radius that fits."""
+    """Return the shortest turn to the next heading that ends on a cell, with the largest radius that fits."""
     a, b = ANGLES[h], ANGLES[h] + math.remainder(ANGLES[(h + turn) % HEADINGS] - ANGLES[h], math.tau)
     lines = np.array([[math.cos(a), math.cos(b)], [math.sin(a), math.sin(b)]])
     arc = turn * np.array([math.sin(b) - math.sin(a), math.cos(a) - math.cos(b)])
@@ -149,7 +149,7 @@ def _turn(h: int, turn: int, radius: float, cell: float) -> tuple[list[_Segment]
     fixed = np.linalg.solve(lines, cells * cell)
     possible = (fixed - radius * slope[:, None] >= -1e-12).all(axis=0)
     cells, fixed = cells[:, possible], fixed[:, possible]
-    # Both lines shrink as the radius grows: to where the first is gone.
+    # Both lines shrink as the radius grows, until the first has length 0.
     shrinking = slope > 1e-12
     gone = fixed[shrinking] / slope[shrinking, None]
     widest = (
@@ -164,7 +164,7 @@ def _turn(h: int, turn: int, radius: float, cell: float) -> tuple[list[_Segment]
 
 
 def _translations(h: int, side: int, crab: float) -> list[tuple[int, int, float]]:
-    """The steepest translation to one side within LONG cells: columns, rows, angle."""
+    """Return the steepest translation to one side within LONG cells: columns, rows, angle."""
     found = []
     for dx in range(-LONG_PRIMITIVE, LONG_PRIMITIVE + 1):
         for dy in range(-LONG_PRIMITIVE, LONG_PRIMITIVE + 1):
@@ -175,30 +175,30 @@ def _translations(h: int, side: int, crab: float) -> list[tuple[int, int, float]
 
 
 class Lattice(NamedTuple):
-    """Primitives and the frame: the start is cell (0, 0), heading 0."""
+    """Primitives and frame of a search: the start is cell (0, 0), heading 0."""
 
     primitives: Primitives
     cell: float
     frame: Array
-    """Shape (3,): the start's pose."""
+    """Start pose, shape (3,)."""
 
 
 class LatticeStates(NamedTuple):
-    """Memory of one search; states are numbered in the order they are found."""
+    """Memory of a search; states are numbered in order of discovery."""
 
     place: IntArray
-    """Shape (n, 3): column, row, heading."""
+    """Column, row, heading, shape (n, 3)."""
     cost: Array
     parent: IntArray
     primitive: IntArray
     closed: NDArray[np.bool_]
     keys: Array
     items: IntArray
-    """The heap of open states."""
+    """Heap of open states."""
     buckets: IntArray
-    """Hash table, a power of two long: state number plus one; 0 = empty."""
+    """Hash table whose length is a power of two: state number plus one; 0 for an empty slot."""
     counts: IntArray
-    """States, open states, states expanded so far, the state before the goal."""
+    """Numbers of states, open states and expanded states, and the state before the goal."""
 
 
 USED, OPEN, EXPANDED, LAST = 0, 1, 2, 3
@@ -206,7 +206,7 @@ USED, OPEN, EXPANDED, LAST = 0, 1, 2, 3
 
 @njit(cache=True)
 def _pose_of(lattice: Lattice, place: IntArray, out: Array) -> None:
-    """Pose of a state."""
+    """Return the pose of a state."""
     c, s = cos(lattice.frame[2]), sin(lattice.frame[2])
     x, y = place[0] * lattice.cell, place[1] * lattice.cell
     out[0] = lattice.frame[0] + x * c - y * s
@@ -216,9 +216,9 @@ def _pose_of(lattice: Lattice, place: IntArray, out: Array) -> None:
 
 @njit(cache=True)
 def _bucket_of(states: LatticeStates, column: int, row: int, heading: int) -> int:
-    """Index in the hash table of a place: its own, or the empty one it would get."""
+    """Return the slot of a place in the hash table: its own, or the empty one for it."""
     mask = len(states.buckets) - 1
-    max_cells = 1 << 15  # on either side of the start
+    max_cells = 1 << 15  # on both sides of the start
     key = ((column + max_cells) << 20) ^ ((row + max_cells) << 4) ^ heading
     i = (key * 0x9E3779B97F4A7C1) >> 12 & mask
     while states.buckets[i] > 0:
@@ -234,7 +234,7 @@ def _open_state(
     field: FieldData, to_go: CostToGo, lattice: Lattice, states: LatticeStates, heuristic_weight: float, bound: float,
     column: int, row: int, heading: int, cost: float, parent: int, primitive: int,
 ) -> None:  # fmt: skip
-    """Put a state on the open list, if its cost is the lowest so far and may lead to a solution below ``bound``."""
+    """Add a state to the open list if its cost is its lowest so far and a solution below ``bound`` is possible."""
     where = np.array([column, row, heading])
     pose = np.empty(3)
     _pose_of(lattice, where, pose)
@@ -268,7 +268,7 @@ def expand(
     field: FieldData, footprint: FootprintData, layer: CostLayer, to_go: CostToGo, model: VehicleMotions,
     lattice: Lattice, goal: Array, states: LatticeStates, heuristic_weight: float, bound: float, count: int,
 ) -> int:  # fmt: skip
-    """Expand up to ``count`` states; only solutions cheaper than ``bound`` (m) count.
+    """Expand up to ``count`` states; only solutions cheaper than ``bound`` (m) are accepted.
 
     Returns:
         RUNNING, FOUND (the goal is reached from the state ``counts[LAST]``) or EXHAUSTED.
@@ -312,7 +312,7 @@ def expand(
 
 @njit(cache=True)
 def _trace(model: VehicleMotions, lattice: Lattice, goal: Array, states: LatticeStates) -> Array:
-    """Segments of the solution at ``counts[LAST]``, from the start to the goal."""
+    """Return the segments of the solution at ``counts[LAST]``, from the start to the goal."""
     depth, n = 0, states.counts[LAST]
     while states.parent[n] >= 0:
         depth += 1
@@ -356,14 +356,14 @@ class LatticePlanner:
         )  # fmt: skip
 
     def plan(self, route_map: RouteMap, start: ArrayLike, goal: ArrayLike, now: Clock | None = None) -> RouteResult:
-        """Route of the vehicle's reference point, see ``RoutePlanner``."""
+        """Plan a route of the vehicle's reference point, see ``RoutePlanner``."""
         budget = Budget(self.config.budget, now, self.config.effort)
         return plan_between(
             route_map, self.vehicle, self.config, start, goal, lambda ends: self._route(route_map, ends, budget), budget
         )
 
     def _route(self, route_map: RouteMap, ends: Endpoints, budget: Budget) -> RouteResult:
-        """Route that keeps the margin from its start on."""
+        """Plan a route that keeps the margin from its start on."""
         config = self.config
         field = route_map.field.data()
         costs = RouteCosts.of(self.vehicle, config)
@@ -392,7 +392,7 @@ class LatticePlanner:
         self, field: FieldData, layer: CostLayer, to_go: CostToGo, ends: Endpoints, budget: Budget, weight: float,
         bound: float, statistics: dict[str, float],
     ) -> tuple[Array | None, float, Reason]:  # fmt: skip
-        """Segments and cost of a solution cheaper than ``bound``, or the reason why there is none."""
+        """Return segments and cost of a solution cheaper than ``bound``, or the reason for the failure."""
         lattice, n = Lattice(self.primitives, self.config.cell, ends.start), 1 << 19
         states = LatticeStates(
             np.empty((n, 3), np.int64), np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64),

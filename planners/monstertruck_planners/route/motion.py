@@ -24,7 +24,7 @@ from monstertruck_schemas.plan import Path, Steering
 def advance(
     x: float, y: float, yaw: float, length: float, curvature: float, sideslip: float
 ) -> tuple[float, float, float]:
-    """Pose after ``length`` metres of a segment."""
+    """Return the pose after ``length`` metres of a segment."""
     half = 0.5 * curvature * length
     chord = length if abs(half) < 1e-7 else length * sin(half) / half
     course = yaw + sideslip + half
@@ -33,7 +33,7 @@ def advance(
 
 @njit(cache=True)
 def _pose_along(pose: Array, segment: Array, travelled: float) -> Array:
-    """Pose (3,) reached from ``pose`` after ``travelled`` metres (not below 0) of a segment."""
+    """Return the pose, (3,), after ``travelled`` metres (not negative) of a segment from ``pose``."""
     length = travelled if segment[0] > 0.0 else -travelled
     x, y, yaw = advance(pose[0], pose[1], pose[2], length, segment[1], segment[2])
     return np.array([x, y, yaw])
@@ -41,7 +41,7 @@ def _pose_along(pose: Array, segment: Array, travelled: float) -> Array:
 
 @njit(cache=True)
 def _end_poses(start: Array, segments: Array) -> Array:
-    """Pose before the first segment and after each, shape (n + 1, 3)."""
+    """Return the poses before the first segment and after each, shape (n + 1, 3)."""
     poses = np.empty((len(segments) + 1, 3))
     x, y, yaw = start[0], start[1], start[2]
     poses[0, 0], poses[0, 1], poses[0, 2] = x, y, yaw
@@ -53,11 +53,11 @@ def _end_poses(start: Array, segments: Array) -> Array:
 
 @njit(cache=True)
 def _sample_poses(start: Array, segments: Array, step: float) -> tuple[Array, NDArray[np.int64]]:
-    """Poses at most ``step`` metres apart, the ends of all segments among them.
+    """Return poses at most ``step`` metres apart, including the ends of all segments.
 
     Returns:
-        Shape (m, 4): x, y, yaw and metres travelled; and shape (m,), the segment that leads to each pose (0
-        for the first).
+        x, y, yaw and distance travelled (m), shape (m, 4); and the segment that leads to each pose (0 for the first),
+        shape (m,).
     """
     total = 1
     for i in range(len(segments)):
@@ -81,20 +81,20 @@ def _sample_poses(start: Array, segments: Array, step: float) -> tuple[Array, ND
 
 @dataclass(frozen=True, slots=True)
 class MotionSamples:
-    """Points along a path; a value belongs to the segment leading to the point (to the first: the first segment)."""
+    """Points along a path; each value belongs to the segment before the point (for the first: the first segment)."""
 
     poses: Array
-    """Shape (m, 3): x, y, yaw of the reference point, yaw continuous."""
+    """x, y, yaw of the reference point, yaw continuous, shape (m, 3)."""
     travelled: Array
-    """Shape (m,), m from the start."""
+    """Distance from the start, shape (m,) (m)."""
     curvature: Array
-    """Shape (m,), 1/m."""
+    """Curvature, shape (m,) (1/m)."""
     sideslip: Array
-    """Shape (m,), rad."""
+    """Sideslip, shape (m,) (rad)."""
     direction: Array
-    """Shape (m,), +1 or -1."""
+    """Direction, shape (m,): +1 or -1."""
     segment: NDArray[np.int64]
-    """Shape (m,), index."""
+    """Index of the segment, shape (m,)."""
 
 
 @dataclass(frozen=True)
@@ -103,12 +103,12 @@ class MotionPath:
 
     Args:
         start: pose (x, y, yaw) of the reference point, shape (3,).
-        segments: shape (n, 3): signed length m, curvature 1/m, sideslip rad; segments of length 0 are dropped.
-        steering: how each segment is steered, n of them, or one for all (those with sideslip become "crab").
-        reference: x of the reference point in base, m: minus half a wheelbase for the rear axle.
+        segments: signed length (m), curvature (1/m) and sideslip (rad), shape (n, 3); segments of length 0 are dropped.
+        steering: steering mode of each of the n segments, or one for all (segments with sideslip become "crab").
+        reference: x of the reference point in base (m): minus half a wheelbase for the rear axle.
 
     Raises:
-        InputError: shapes or numbers that do not form a path.
+        InputError: the arrays have wrong shapes or invalid numbers.
     """
 
     start: Array
@@ -134,26 +134,26 @@ class MotionPath:
 
     @property
     def length(self) -> float:
-        """Metres travelled by the reference point."""
+        """Distance travelled by the reference point (m)."""
         return float(np.abs(self.segments[:, 0]).sum())
 
     @property
     def backward(self) -> float:
-        """Metres travelled backward."""
+        """Distance travelled backward (m)."""
         return float(np.maximum(-self.segments[:, 0], 0.0).sum())
 
     @property
     def cusps(self) -> int:
-        """Changes between forward and backward."""
+        """Number of changes between forward and backward."""
         return cusps_of(self.segments)
 
     def copied(self) -> tuple[Array, Array]:
-        """Start and segments as arrays that may be written to, the only kind that the searches are compiled for."""
+        """Start and segments as writable arrays, the only kind accepted by the compiled searches."""
         return self.start.copy(), self.segments.copy()
 
     @property
     def greatest_curvature(self) -> float:
-        """1/m, 0 for an empty path."""
+        """Maximum curvature (1/m), 0 for an empty path."""
         return float(np.abs(self.segments[:, 1]).max(initial=0.0))
 
     @cached_property
@@ -167,10 +167,10 @@ class MotionPath:
         return np.asarray(self.ends[-1])
 
     def sample(self, step: float) -> MotionSamples:
-        """Points at most ``step`` metres apart; the end of each segment is among them.
+        """Return points at most ``step`` metres apart, including the end of each segment.
 
         Raises:
-            InputError: step not above 0.
+            InputError: ``step`` is not positive.
         """
         if not step > 0.0:
             raise InputError(f"sampling step {step} m: expected above 0")
@@ -179,25 +179,25 @@ class MotionPath:
         return MotionSamples(poses[:, :3], poses[:, 3], segments[:, 1], segments[:, 2], np.sign(segments[:, 0]), index)
 
     def along(self, step: float = 0.08) -> PosePath:
-        """Poses of the reference point, one every ``step`` metres."""
+        """Return the poses of the reference point, one every ``step`` metres."""
         samples = self.sample(step)
         return PosePath(samples.poses, samples.direction)
 
     def base_path(self, step: float = 0.05) -> PosePath:
-        """Poses of the base, one every ``step`` metres, with the ways of steering."""
+        """Return the poses of the base, one every ``step`` metres, with their steering modes."""
         samples = self.sample(step)
         steering = tuple(self.steering[i] for i in samples.segment.tolist()) if self.steering else ()
         return PosePath(moved(samples.poses, -self.reference), samples.direction, steering)  # type: ignore[arg-type]
 
     def base_poses(self, step: float) -> Array:
-        """Poses of the base at the sampled points, shape (m, 3)."""
+        """Return the poses of the base at the sampled points, shape (m, 3)."""
         return moved(self.sample(step).poses, -self.reference)
 
     def then(self, other: "MotionPath") -> "MotionPath":
-        """This path followed by ``other``, which has to start where this one ends.
+        """Return this path followed by ``other``, which must start at its end.
 
         Raises:
-            InputError: another reference point, or a gap of more than a millimetre or milliradian.
+            InputError: the reference points differ, or the gap exceeds a millimetre or milliradian.
         """
         gap = np.abs(other.start - self.end)
         gap[2] = abs(np.remainder(gap[2] + np.pi, 2 * np.pi) - np.pi)
@@ -208,7 +208,7 @@ class MotionPath:
         )
 
     def part(self, begin: float, end: float) -> "MotionPath":
-        """The piece between two distances from the start, m; both are kept within the path."""
+        """Return the part between two distances from the start (m), both clamped to the path."""
         before = np.concatenate(([0.0], np.cumsum(np.abs(self.segments[:, 0]))))
         begin, end = (min(max(v, 0.0), float(before[-1])) for v in (begin, end))
         first = np.clip(begin - before[:-1], 0.0, np.diff(before))
@@ -224,7 +224,7 @@ class MotionPath:
         return MotionPath(start, segments[keep], steering, self.reference)  # type: ignore[arg-type]
 
     def message(self, *, stamp: int, seq: int = 0, frame: str = "map", name: str = "", step: float = 0.05) -> Path:
-        """The path of the base as a ``plan/path`` message, sampled every ``step`` metres."""
+        """Return the path of the base as a ``plan/path`` message, sampled every ``step`` metres."""
         path = self.base_path(step)
         return Path(
             stamp=stamp,
@@ -239,12 +239,12 @@ class MotionPath:
 
 
 def cusps_of(segments: Array) -> int:
-    """Changes between forward and backward in segments, shape (n, 3), all with a length."""
+    """Return the number of changes of direction in segments, shape (n, 3), all with a length."""
     return int(np.count_nonzero(np.diff(np.sign(segments[:, 0]))))
 
 
 def moved(poses: Array, ahead: float) -> Array:
-    """Poses (m, 3) of the point ``ahead`` metres in front of the given ones."""
+    """Return the poses (m, 3) of the point ``ahead`` metres in front of the given ones."""
     result = np.array(poses, dtype=np.float64)
     result[..., 0] += ahead * np.cos(poses[..., 2])
     result[..., 1] += ahead * np.sin(poses[..., 2])
@@ -252,7 +252,7 @@ def moved(poses: Array, ahead: float) -> Array:
 
 
 def joined(paths: Sequence[MotionPath]) -> MotionPath:
-    """Several paths as one, see ``MotionPath.then``; at least one is needed."""
+    """Join several paths, at least one, see ``MotionPath.then``."""
     result = paths[0]
     for path in paths[1:]:
         result = result.then(path)

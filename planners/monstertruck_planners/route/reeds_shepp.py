@@ -24,10 +24,10 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.plan import Steering
 
 SLACK = 1e-10
-"""Rounding allowed where a formula asks for a sign."""
+"""Rounding tolerance for signs in the formulas."""
 
 MAX_SEGMENTS = 5
-"""Segments of a motion at most."""
+"""Maximum number of segments in a motion."""
 
 LSL, LSR, LRL, LRLR_SAME, LRLR_CUSP, LRSL, LRSR, LRSLR = range(8)
 
@@ -54,19 +54,19 @@ COST, PATTERN, FLIP, MIRROR, BACKWARD, T, U, V = range(8)
 
 @njit(cache=True)
 def _wrap_upper(angle: float) -> float:
-    """Angle in (-pi, pi], a rounding error above -pi counting as pi."""
+    """Wrap an angle to (-pi, pi], with a rounding error above -pi mapped to pi."""
     return float(angle - 2 * pi * ceil((angle - pi - SLACK) / (2 * pi)))
 
 
 @njit(cache=True)
 def _wrap_lower(angle: float) -> float:
-    """Angle in [-pi, pi), a rounding error below pi counting as -pi."""
+    """Wrap an angle to [-pi, pi), with a rounding error below pi mapped to -pi."""
     return float(angle - 2 * pi * floor((angle + pi + SLACK) / (2 * pi)))
 
 
 @njit(cache=True)
 def _lengths(pattern: int, t: float, u: float, v: float, out: Array) -> None:
-    """Signed lengths of a pattern's pieces."""
+    """Return the signed lengths of a pattern's pieces."""
     out[0], out[1], out[2], out[3], out[4] = t, u, v, 0.0, 0.0
     if pattern == LRLR_SAME:
         out[2], out[3] = -u, v
@@ -119,7 +119,7 @@ def _word_cost(pieces: Array, flip: float, weights: Array) -> float:
 
 @njit(cache=True)
 def _tau_omega(u: float, v: float, xi: float, eta: float, phi: float) -> tuple[float, float]:
-    """First and last angle of the four-arc patterns, whose middle angles are u and v."""
+    """Return first and last angle of the four-arc patterns with middle angles u and v."""
     delta = u - v
     a, b = sin(u) - sin(delta), cos(u) - cos(delta) - 1.0
     t = atan2(eta * a - xi * b, xi * a + eta * b)
@@ -197,15 +197,15 @@ def _symmetric_patterns(
 
 @njit(cache=True)
 def _best_word(x: float, y: float, phi: float, weights: Array, best: Array, pieces: Array) -> None:
-    """Cheapest word from the origin to (x, y, phi).
+    """Find the cheapest word from the origin to (x, y, phi).
 
     Args:
-        x: in turning radii.
-        y: in turning radii.
-        phi: rad.
-        weights: cost of a radius backward (at least 1), and of a change of direction (at least 0).
-        best: shape (8,), receives the solution.
-        pieces: shape (5,), scratch.
+        x: position (turning radii).
+        y: position (turning radii).
+        phi: heading (rad).
+        weights: cost per radius backward (at least 1), and of a change of direction (at least 0).
+        best: solution, shape (8,), written in place.
+        pieces: scratch array, shape (5,).
     """
     best[COST] = inf
     sin_phi, cos_phi = sin(phi), cos(phi)
@@ -227,7 +227,7 @@ def _best_word(x: float, y: float, phi: float, weights: Array, best: Array, piec
 
 @njit(cache=True)
 def write_segments(best: Array, radius: float, segments: Array, pieces: Array) -> int:
-    """Write a solution as at most 5 segments (signed length m, curvature 1/m, sideslip rad); returns their number."""
+    """Write a solution as up to 5 segments (signed length m, curvature 1/m, sideslip rad); return their number."""
     pattern = int(best[PATTERN])
     count = PIECES[pattern]
     _lengths(pattern, best[T], best[U], best[V], pieces)
@@ -246,7 +246,7 @@ def write_segments(best: Array, radius: float, segments: Array, pieces: Array) -
 
 @njit(cache=True)
 def _relative_pose(start: Array, goal: Array, radius: float) -> tuple[float, float, float]:
-    """Goal relative to the start, lengths in turning radii, the angle within +-pi."""
+    """Return the goal relative to the start, lengths in turning radii, the angle within +-pi."""
     dx, dy = (goal[0] - start[0]) / radius, (goal[1] - start[1]) / radius
     c, s = cos(start[2]), sin(start[2])
     turn = goal[2] - start[2]
@@ -255,7 +255,7 @@ def _relative_pose(start: Array, goal: Array, radius: float) -> tuple[float, flo
 
 @njit(cache=True)
 def _word_distances(starts: Array, goals: Array, radius: float, weights: Array) -> Array:
-    """Cost of the cheapest word of every pair, in radii times ``radius``."""
+    """Return the cost of the cheapest word of every pair, in radii times ``radius``."""
     result = np.empty(len(starts))
     best, pieces = np.empty(8), np.empty(5)
     for i in range(len(starts)):
@@ -278,7 +278,7 @@ def _wrap(angle: float) -> float:
 def _keep_if_cheaper(
     word: Array, count: int, mirror: float, weights: Array, best: Array, segments: Array, kept: int
 ) -> int:
-    """Keep a word (not yet mirrored) if it is the cheapest so far; returns the number of segments of the best one."""
+    """Keep a word (before mirroring) if it is the cheapest so far; return the number of segments of the best one."""
     cost, before = 0.0, 0.0
     for i in range(count):
         length = word[i, 0]
@@ -316,7 +316,7 @@ def _arc_crab_arc(
     x: float, y: float, phi: float, crab: float, mirror: float, weights: Array,
     word: Array, best: Array, segments: Array, kept: int,
 ) -> int:  # fmt: skip
-    """Left arc, translation, left or right arc; the translation joins the two turning circles."""
+    """Try left arc, translation, left or right arc; the translation joins the two turning circles."""
     xi, eta = x - sin(phi), y - 1.0 + cos(phi)
     r, a = sqrt(xi * xi + eta * eta), atan2(eta, xi)
     xi2, eta2 = x + sin(phi), y - 1.0 - cos(phi)
@@ -344,7 +344,7 @@ def _arc_crab_arc(
 
 @njit(cache=True)
 def _translation(word: Array, first: int, x: float, y: float, crab: float) -> int:
-    """Segments of the shortest translation by (x, y), from index ``first`` on; returns their number."""
+    """Write the segments of the shortest translation by (x, y), from index ``first`` on; return their number."""
     r = sqrt(x * x + y * y)
     angle = atan2(y, x)
     if abs(angle) <= crab:
@@ -365,7 +365,7 @@ def _arc_and_crab(
     x: float, y: float, phi: float, crab: float, mirror: float, weights: Array,
     word: Array, best: Array, segments: Array, kept: int,
 ) -> int:  # fmt: skip
-    """Left arc and translation in both orders."""
+    """Try left arc and translation in both orders."""
     px, py = x - sin(phi), y - 1.0 + cos(phi)
     c, s = cos(phi), sin(phi)
     _set_segment(word, 0, phi, 1.0, 0.0)
@@ -381,17 +381,17 @@ def connect(
     start: Array, goal: Array, radius: float, crab: float, weights: Array,
     segments: Array, best: Array, scratch: Array,
 ) -> int:  # fmt: skip
-    """Cheapest motion from one pose to another.
+    """Find the cheapest motion from one pose to another.
 
     Args:
         start: x, y (m), yaw (rad).
-        goal: the same.
-        radius: turning radius, m.
-        crab: largest angle of a translation, rad; 0 for none.
-        weights: cost per metre backward and of a change of direction (in radii), factor on translations.
-        segments: shape (5, 3), receives the motion: signed length m, curvature 1/m, sideslip rad.
-        best: shape (8,), receives the cost in radii as its first field.
-        scratch: shape (4, 3).
+        goal: x, y (m), yaw (rad).
+        radius: turning radius (m).
+        crab: maximum angle of a translation (rad); 0 for none.
+        weights: cost per metre backward and of a change of direction (radii), and factor on translations.
+        segments: motion, shape (5, 3), written in place: signed length m, curvature 1/m, sideslip rad.
+        best: array, shape (8,), whose first field receives the cost in radii.
+        scratch: scratch array, shape (4, 3).
 
     Returns:
         Number of segments.
@@ -418,7 +418,7 @@ def connect(
 
 @njit(cache=True)
 def _crab_distances(starts: Array, goals: Array, radius: float, crab: float, weights: Array) -> Array:
-    """Cost in metres of the cheapest motion of every pair."""
+    """Return the cost of the cheapest motion of every pair (m)."""
     result = np.empty(len(starts))
     segments, best, scratch = np.empty((MAX_SEGMENTS, 3)), np.full(8, inf), np.empty((4, 3))
     for i in range(len(starts)):
@@ -429,7 +429,7 @@ def _crab_distances(starts: Array, goals: Array, radius: float, crab: float, wei
 
 @njit(cache=True)
 def _best_segments(start: Array, goal: Array, radius: float, crab: float, weights: Array) -> Array:
-    """Segments of the cheapest motion, shape (n, 3)."""
+    """Return the segments of the cheapest motion, shape (n, 3)."""
     segments, best, scratch = np.empty((MAX_SEGMENTS, 3)), np.full(8, inf), np.empty((4, 3))
     return segments[: connect(start, goal, radius, crab, weights, segments, best, scratch)]
 
@@ -441,16 +441,16 @@ class ReedsShepp:
     With the default costs a motion's cost is its length: the exact Reeds-Shepp metric.
 
     Args:
-        radius: turning radius of the reference point, m.
-        crab_angle: largest angle between heading and a translation, rad; 0: no translations.
-        reverse_cost: of a metre backward, at least 1.
-        cusp_cost: of a change of direction, m, at least 0.
-        crab_cost: factor on a translation's cost, at least 1.
-        steering: mode of arcs and lines, see ``MotionPath``.
+        radius: turning radius of the reference point (m).
+        crab_angle: maximum angle between heading and translation (rad); 0 for no translations.
+        reverse_cost: cost per metre backward, at least 1.
+        cusp_cost: cost of a change of direction (m), at least 0.
+        crab_cost: cost factor of a translation, at least 1.
+        steering: steering mode of arcs and lines, see ``MotionPath``.
         reference: reference of the motions, see ``MotionPath``.
 
     Raises:
-        InputError: a number out of these bounds.
+        InputError: a number is out of these bounds.
     """
 
     radius: float
@@ -461,7 +461,7 @@ class ReedsShepp:
     steering: Steering = "counter"
     reference: float = 0.0
     weights: Array = field(init=False, repr=False, compare=False)
-    """The costs as ``connect`` takes them."""
+    """Return the costs in the form used by ``connect``."""
 
     def __post_init__(self) -> None:
         if not (
@@ -480,11 +480,11 @@ class ReedsShepp:
         object.__setattr__(self, "weights", weights)
 
     def distance(self, starts: ArrayLike, goals: ArrayLike) -> Array:
-        """Cost of the best motion of every pair, m.
+        """Return the cost of the best motion of every pair (m).
 
         Args:
             starts: shape (n, 3) or (3,).
-            goals: the same shape, or one of the two is a single pose.
+            goals: poses in the same shape; either argument may be a single pose.
 
         Returns:
             Shape (n,).
@@ -495,7 +495,7 @@ class ReedsShepp:
         return _word_distances(a, b, self.radius, self.weights)
 
     def path(self, start: ArrayLike, goal: ArrayLike) -> MotionPath:
-        """Best motion from one pose to another."""
+        """Return the best motion from one pose to another."""
         a, b = _poses(start)[0].copy(), _poses(goal)[0].copy()
         segments = _best_segments(a, b, self.radius, self.crab_angle, self.weights)
         return MotionPath(a, segments, self.steering, self.reference)

@@ -1,4 +1,4 @@
-"""Makes a drawn path drivable: Reeds-Shepp motions, with their changes of direction, replace its impossible bends.
+"""Conversion of a drawn path to a drivable one: Reeds-Shepp motions, with cusps, replace its impossible bends.
 
 Loads numba.
 """
@@ -32,7 +32,7 @@ def repaired(
 
     Args:
         path: see ``check_path``.
-        config: tolerance, axle angle and way of steering of the tracker.
+        config: tolerance, axle angle and steering mode of the tracker.
         geometry: geometry of the body.
         free: whether poses (n, 3) are free on the map, shape (n,); None without a map.
 
@@ -40,7 +40,7 @@ def repaired(
         The path, and a text for each replaced bend.
 
     Raises:
-        InputError: a bend has no replacement, or an obstacle is in its way; names the place.
+        InputError: a bend has no replacement, or an obstacle blocks the replacement; names the place.
     """
     texts: list[str] = []
     while (found := next(bends(path, config, geometry), None)) is not None:
@@ -69,12 +69,12 @@ def _piece(path: Path, bend: Bend, config: TrackerConfig, geometry: FourWheelSte
     drawn = PosePath.of(path)
     poses = drawn.poses[bend.first : bend.last + 1]
     direction = float(drawn.directions[bend.last])
-    count = math.ceil(abs(bend.turn) / math.pi - 1e-6)  # a shortest motion would leave out a whole turn
+    count = math.ceil(abs(bend.turn) / math.pi - 1e-6)  # a shortest motion would omit a whole turn
     at = np.linspace(0, len(poses) - 1, count + 1).round().astype(np.intp)
     begin = _heading(drawn.poses, bend.first) + (0.0 if direction > 0 else math.pi)
     stations = np.column_stack((poses[at, :2], begin + bend.turn * np.linspace(0.0, 1.0, count + 1)))
     vehicle = Vehicle.truck("2ws" if config.steering == "front" else "counter", angle=config.angle, geometry=geometry)
-    # 1.5: what a metre in the other direction costs: the first and the last arc lead on as the path does
+    # 1.5: cost per metre in the opposite direction: the first and the last arc continue like the path
     planner = vehicle.reeds_shepp(DriveCosts(reverse_cost=1.5))
     piece: PosePath | None = None
     for start, end in pairwise(stations):

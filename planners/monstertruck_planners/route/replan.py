@@ -1,4 +1,4 @@
-"""Routes over waypoints, and reuse of the previous route while it is good. Loads numba."""
+"""Routes over waypoints, and reuse of a previous route that is still good. Loads numba."""
 
 import math
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason
 
 PASSING = 0.1
-"""Maximum distance of a route from a waypoint that it passes (m)."""
+"""Maximum distance of a route from its waypoints (m)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ def plan_through(
     waypoints: Sequence[ViaPoint],
     now: Clock | None = None,
 ) -> RouteResult:
-    """Plan a route over all waypoints in turn; the last is the goal, and the legs share the budget.
+    """Plan a route over all waypoints in turn, with a shared budget; the last waypoint is the goal.
 
     Raises:
         InputError: there is no waypoint.
@@ -119,12 +119,12 @@ def replan(
     Args:
         planner: planner of both routes.
         route_map: latest map.
-        previous: the route so far.
+        previous: route so far.
         pose: pose of the reference point.
         goal: goal of the reference point.
         now: see ``plan``.
-        policy: when a route is kept.
-        via: poses of the reference point to be passed before the goal.
+        policy: conditions for keeping a route.
+        via: poses of the reference point to pass before the goal.
     """
     policy = policy or KeepPolicy()
     stops = [ViaPoint(*place.tolist()) for place in (*via, np.asarray(goal, dtype=np.float64))] if via else []
@@ -148,7 +148,7 @@ def replan(
 def _fall_allowed(
     keeper: HybridPlanner, route_map: RouteMap, fresh: RouteResult, pose: ArrayLike, policy: KeepPolicy
 ) -> float | None:
-    """See ``remaining_route``: about as much as for a new route, if that begins with a departure."""
+    """See ``remaining_route``; if the route begins with a departure, it takes about as long as planning a new one."""
     if not needs_departure(route_map, keeper.vehicle, np.asarray(pose, dtype=np.float64), keeper.config.margin):
         return None
     if fresh.path is None:
@@ -158,7 +158,7 @@ def _fall_allowed(
 
 
 def _judge(planner: RoutePlanner) -> HybridPlanner:
-    """Judges which paths are free, and their cost by the settings that the planner shares with hybrid A*."""
+    """Judge whether paths are free, and their cost with the settings shared with hybrid A*."""
     if isinstance(planner, HybridPlanner):
         return planner
     shared = (set(type(planner.config).model_fields) & set(HybridConfig.model_fields)) - {"kind"}
@@ -169,22 +169,23 @@ def remaining_route(
     planner: HybridPlanner, route_map: RouteMap, path: MotionPath, pose: ArrayLike, goal: ArrayLike, reach: float,
     fall: float | None = None,
 ) -> MotionPath | None:  # fmt: skip
-    """A free path from the pose back onto the route and along it to its end, or None.
+    """Return a free path from the pose back to the route and along it to its end, or None.
 
-    Where the pose is nearer to an obstacle than the margin, the rest of the route's departure is driven as it is, or
-    left for the route beyond it: the path touches nothing, and keeps the margin from where it first has it.
+    If the pose is nearer to an obstacle than the margin, the rest of the route's departure is driven unchanged, or
+    skipped by a motion to the route beyond it. Such a path touches no obstacle, and keeps the margin from its first
+    pose with the margin on.
 
     Args:
         planner: planner of the path.
-        route_map: the latest map.
-        path: the route so far.
+        route_map: latest map.
+        path: route so far.
         pose: pose of the reference point.
-        goal: where the path has to end.
-        reach: greatest distance of the pose from the path, m.
-        fall: maximum fall of the clearance on a departure, m; None: the path has to keep the margin all the way.
+        goal: required end of the path.
+        reach: maximum distance of the pose from the path (m).
+        fall: maximum fall of the clearance on a departure (m); None: the path must keep the margin throughout.
     """
     here, there = np.asarray(pose, dtype=np.float64), np.asarray(goal, dtype=np.float64)
-    # 1e-3: goals nearer than this are the same, m and rad
+    # 1e-3: maximum difference of equal goals, m and rad
     if not np.isfinite(here).all() or not len(path.segments) or _apart(path.end, there) > planner.tolerance + 1e-3:
         return None
     samples = path.sample(0.01)

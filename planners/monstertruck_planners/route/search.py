@@ -23,18 +23,18 @@ RUNNING, FOUND, EXHAUSTED = 0, 1, 2
 """State of a search after an ``expand``."""
 
 CHUNK = 256
-"""Nodes expanded between two checks of the budget."""
+"""Number of nodes expanded between two checks of the budget."""
 
 CHECK_STEP = 0.01
-"""Distance between two collision checks close to obstacles, m."""
+"""Distance between two collision checks close to obstacles (m)."""
 
 CHECK_MARGIN = 1e-3
-"""Added to the margin, as the footprint may come nearer between two checks, m."""
+"""Allowance in the margin for an approach between two checks (m)."""
 
 
 @njit(cache=True)
 def push(keys: Array, items: IntArray, size: int, key: float, item: int) -> int:
-    """Add an entry to a binary heap of ``size`` entries in two arrays long enough; returns the new size.
+    """Add an entry to a binary heap of ``size`` entries in two sufficiently long arrays; return the new size.
 
     The smallest key is at index 0; entries of equal keys leave in the order of their numbers.
     """
@@ -51,7 +51,7 @@ def push(keys: Array, items: IntArray, size: int, key: float, item: int) -> int:
 
 @njit(cache=True)
 def drop(keys: Array, items: IntArray, size: int) -> int:
-    """Remove the first entry of a heap (read index 0 before); returns the new size."""
+    """Remove the first entry of a heap (read index 0 before); return the new size."""
     size -= 1
     key, item = keys[size], items[size]
     i = 0
@@ -71,28 +71,28 @@ def drop(keys: Array, items: IntArray, size: int) -> int:
 
 
 class CostLayer(NamedTuple):
-    """Extra cost per metre in the cells of a field's ringed grid."""
+    """Layer of extra costs per metre in the cells of a field's ringed grid."""
 
     terrain: NDArray[np.float32]
-    """Cost of the ground in each cell; an empty array: none."""
+    """Cost of the ground in each cell; an empty array for none."""
     contact: float
-    """Distance to an obstacle's centre when the footprint's side touches it, m."""
+    """Distance to an obstacle's centre at contact of the footprint's side (m)."""
     clearance: float
-    """Further distance without cost, above 0 m."""
+    """Further distance within which motion costs extra, positive (m)."""
     clearance_cost: float
-    """Cost of a metre in contact."""
+    """Cost per metre in contact."""
 
 
 @njit(cache=True)
 def clearance_cost(layer: CostLayer, distance: float) -> float:
-    """Extra cost of a metre at a distance from obstacles."""
+    """Return the extra cost per metre at a distance from obstacles."""
     near = 1.0 - (distance - layer.contact) / layer.clearance
     return layer.clearance_cost * min(max(near, 0.0), 1.0)
 
 
 @njit(cache=True)
 def extra_cost(distance: NDArray[np.float32], layer: CostLayer, row: int, column: int) -> float:
-    """Extra cost of a metre in a cell."""
+    """Return the extra cost per metre in a cell."""
     cost = clearance_cost(layer, distance[row, column])
     if layer.terrain.size > 0:
         cost += layer.terrain[row, column]
@@ -103,11 +103,11 @@ def extra_cost(distance: NDArray[np.float32], layer: CostLayer, row: int, column
 def layer_cost(
     field: FieldData, layer: CostLayer, x: float, y: float, yaw: float, length: float, curvature: float, sideslip: float
 ) -> float:
-    """Extra cost of a motion segment: the layer summed at the middles of pieces of about 0.1 m."""
+    """Return the extra cost of a motion segment: the layer summed at the middles of pieces of about 0.1 m."""
     if layer.terrain.size == 0 and layer.clearance_cost == 0.0:
         return 0.0
     rows, columns = field.distance.shape
-    pieces = max(ceil(abs(length) / 0.1), 1)  # distance between two samples of the cost layer, m
+    pieces = max(ceil(abs(length) / 0.1), 1)  # distance between samples of the cost layer, m
     total = 0.0
     for i in range(pieces):
         px, py, _ = advance(x, y, yaw, length * (i + 0.5) / pieces, curvature, sideslip)
@@ -123,34 +123,34 @@ class VehicleMotions(NamedTuple):
     """Limits, costs and motion primitives of the vehicle."""
 
     radius: float
-    """Minimum turning radius, m."""
+    """Minimum turning radius (m)."""
     crab: float
-    """Largest angle of a translation, rad; 0: none."""
+    """Maximum angle of a translation (rad); 0 for none."""
     weights: Array
-    """Shape (3,): per metre backward, of a cusp in turning radii, per metre of translation."""
+    """Costs per metre backward, of a cusp (turning radii) and per metre of translation, shape (3,)."""
     steering_change_cost: float
-    """Cost of every segment, because the wheels turn at its start, m."""
+    """Cost of every segment (m), because the wheels turn at its start."""
     primitives: Array
-    """Shape (p, 3): the motion primitives, one segment each."""
+    """Motion primitives, one segment each, shape (p, 3)."""
     expansion_lengths: Array
-    """Distances along the cost-to-go path of the targets of analytic expansions, m, longest first."""
+    """Distances along the cost-to-go path to the targets of analytic expansions (m), longest first."""
     check_step: float
-    """Step of the collision check, m."""
+    """Step of the collision check (m)."""
     margin: float
-    """Kept on all sides of the footprint, m."""
+    """Margin on all sides of the footprint (m)."""
     free_cusps: int
-    """Cusps of a route without extra cost."""
+    """Number of cusps in a route without extra cost."""
     many_cusps_cost: float
-    """Extra cost of each other one, m."""
+    """Extra cost of each further cusp (m)."""
     max_cusps: int
-    """More than that a route may not have."""
+    """Maximum number of cusps in a route."""
     strokes: bool
-    """Whether a search also drives arcs as far as they are free: few cusps where there is little room."""
+    """Whether a search also drives arcs as far as they are free, which saves cusps in narrow places."""
 
 
 @njit(cache=True)
 def count_cusps(segments: Array, count: int, direction: float) -> int:
-    """Changes of direction in ``count`` segments driven after one of this direction (sign; 0: none)."""
+    """Return the changes of direction in ``count`` segments after one of this direction (sign; 0: none)."""
     cusps = 0
     for i in range(count):
         if segments[i, 0] * direction < 0.0:
@@ -161,7 +161,7 @@ def count_cusps(segments: Array, count: int, direction: float) -> int:
 
 @njit(cache=True)
 def many_cusps_cost(model: VehicleMotions, before: int, more: int) -> float:
-    """Extra cost of ``more`` cusps in a route that has had some before, m."""
+    """Return the extra cost of ``more`` cusps after earlier ones in a route (m)."""
     free = model.free_cusps
     return model.many_cusps_cost * (max(before + more - free, 0) - max(before - free, 0))
 
@@ -176,9 +176,9 @@ def segments_cost(
     count: int,
     direction: float,
 ) -> float:
-    """Cost of ``count`` segments driven from a pose after a segment of this direction (sign; 0: none), m.
+    """Return the cost of ``count`` segments from a pose after a segment of this direction (sign; 0: none) (m).
 
-    That of many cusps is not in it, see ``many_cusps_cost``.
+    It excludes the extra cost of many cusps, see ``many_cusps_cost``.
     """
     total = 0.0
     x, y, yaw = pose[0], pose[1], pose[2]
@@ -198,7 +198,7 @@ def segments_cost(
 
 @njit(cache=True)
 def route_cost(field: FieldData, layer: CostLayer, model: VehicleMotions, start: Array, segments: Array) -> float:
-    """Cost of a whole route, m."""
+    """Return the cost of a whole route (m)."""
     count = len(segments)
     cost = segments_cost(field, layer, model, start, segments, count, 0.0)
     return cost + many_cusps_cost(model, 0, count_cusps(segments, count, 0.0))
@@ -208,7 +208,7 @@ def route_cost(field: FieldData, layer: CostLayer, model: VehicleMotions, start:
 def free_length(
     field: FieldData, footprint: FootprintData, model: VehicleMotions, pose: Array, segment: Array, longest: float
 ) -> float:
-    """Collision-free length (m, unsigned) of an extended segment; 0 beyond ``longest``."""
+    """Return the collision-free length (m, unsigned) of an extended segment; 0 beyond ``longest``."""
     sign = 1.0 if segment[0] > 0.0 else -1.0
     pace = 1.0 + abs(segment[1]) * footprint.reach
     step = model.check_step if segment[2] == 0.0 else 0.25 * model.check_step

@@ -1,4 +1,4 @@
-"""Segments of a drivable path while they are changed in place. Loads numba."""
+"""Buffer for changing the segments of a drivable path in place. Loads numba."""
 
 from typing import NamedTuple
 
@@ -10,18 +10,18 @@ from monstertruck_planners.route.motion import advance
 from monstertruck_planners.route.search import IntArray
 
 MIN_SEGMENT = 1e-9
-"""Shorter segments are dropped, m."""
+"""Minimum length of a segment (m); shorter ones are dropped."""
 
 
 class SegmentBuffer(NamedTuple):
-    """Segments of a ``MotionPath`` while they are changed in place, with room for more and where they lead."""
+    """Segments of a ``MotionPath`` with their poses, changed in place, with room for more."""
 
     segments: Array
-    """Shape (n, 3); the first ``used[0]`` rows are in use."""
+    """Segments, shape (n, 3); the first ``used[0]`` rows are in use."""
     poses: Array
-    """Shape (n + 1, 3), before each segment and after the last."""
+    """Poses before each segment and after the last, shape (n + 1, 3)."""
     travelled: Array
-    """Shape (n + 1,), m."""
+    """Distances from the start to these poses, shape (n + 1,) (m)."""
     used: IntArray
 
 
@@ -66,7 +66,7 @@ def pose_at(path: SegmentBuffer, i: int, s: float, out: Array) -> None:
 
 @njit(cache=True)
 def _append(out: Array, used: int, length: float, curvature: float, sideslip: float) -> int:
-    """Add a segment; one that continues the last one makes that longer."""
+    """Add a segment, or extend the last one if it continues it."""
     if abs(length) < MIN_SEGMENT:
         return used
     if used > 0:
@@ -90,7 +90,7 @@ def _merge_alike(path: SegmentBuffer) -> None:
 
 
 def editable(start: Array, segments: Array) -> SegmentBuffer:
-    """Return a buffer that holds these segments, with room for more."""
+    """Return a buffer with these segments and room for more."""
     room = len(segments) + 400
     path = SegmentBuffer(np.empty((room, 3)), np.empty((room + 1, 3)), np.empty(room + 1), np.array([len(segments)]))
     path.segments[: len(segments)] = segments
@@ -100,7 +100,7 @@ def editable(start: Array, segments: Array) -> SegmentBuffer:
 
 
 def current_segments(path: SegmentBuffer) -> Array:
-    """Segments in use, shape (n, 3), not copied."""
+    """Return the segments in use, shape (n, 3), without a copy."""
     return path.segments[: path.used[0]]
 
 
@@ -134,7 +134,7 @@ def splice(
 
 @njit(cache=True)
 def stretch_segments(path: SegmentBuffer, begin: float, i: int, end: float, j: int, out: Array) -> int:
-    """Segments of a stretch; returns their number."""
+    """Copy the segments of a stretch; return their number."""
     used = 0
     for k in range(i, j + 1):
         low, high = max(begin - path.travelled[k], 0.0), min(end, path.travelled[k + 1]) - path.travelled[k]
@@ -145,7 +145,7 @@ def stretch_segments(path: SegmentBuffer, begin: float, i: int, end: float, j: i
 
 @njit(cache=True)
 def restore(path: SegmentBuffer, segments: Array, used: int) -> None:
-    """The segments from before a trial."""
+    """Restore the segments from before a trial."""
     path.segments[:used] = segments[:used]
     path.used[0] = used
     _update_poses(path, 0)

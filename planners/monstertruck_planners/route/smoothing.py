@@ -1,11 +1,11 @@
 """Smoothing of a drivable path: shortcuts, and the best headings along it. Loads numba.
 
-Two kinds of shortcut trial, both on a random stretch of the path: replace it by the best motion between its ends; or by
-the two best motions over a pose in its middle, moved a little. A trial is kept if it costs less and is free, so the
-path stays drivable after every trial and its curvature never exceeds its arcs' curvature.
+Both kinds of shortcut trial use a random stretch of the path: the first replaces it by the best motion between its
+ends; the second by the two best motions over a slightly moved pose in its middle. A trial is kept if it costs less and
+is free. The path therefore stays drivable after every trial, and its curvature never exceeds the curvature of its arcs.
 
-Shortcuts find the nearest optimum only: they never turn a truck around that drives a long way forward where backward is
-shorter. Dynamic programming over places along the path decides where the truck faces ahead and where it changes
+Shortcuts find only the nearest optimum: they never turn a truck around that drives a long distance forward where
+backward is shorter. Dynamic programming over places along the path decides the truck's headings and its changes of
 direction.
 """
 
@@ -40,7 +40,7 @@ from monstertruck_planners.route.segment_buffer import (
 
 @njit(cache=True)
 def _cusps_with_ends(segments: Array, count: int, before: float, after: float) -> int:
-    """Cusps of a stretch between segments of these directions (sign; 0: none)."""
+    """Return the cusps of a stretch between segments of these directions (sign; 0: none)."""
     cusps = count_cusps(segments, count, before)
     last = segments[count - 1, 0] if count > 0 else before
     return cusps + (1 if last * after < 0.0 else 0)
@@ -48,7 +48,7 @@ def _cusps_with_ends(segments: Array, count: int, before: float, after: float) -
 
 @njit(cache=True)
 def _around(path: SegmentBuffer, begin: float, i: int, end: float, j: int) -> tuple[float, float]:
-    """Directions (sign; 0: none) before and after the stretch from ``begin`` (in segment i) to ``end`` (in j)."""
+    """Return the directions (sign; 0: none) before and after the stretch from ``begin`` (in i) to ``end`` (in j)."""
     before, after = path.segments[i, 0], path.segments[j, 0]
     if begin - path.travelled[i] <= MIN_SEGMENT:
         before = path.segments[i - 1, 0] if i > 0 else 0.0
@@ -73,20 +73,20 @@ def shortcut(
     shift: float,
     random: Array,
 ) -> int:
-    """Shortcut trials, one for each row of ``random``.
+    """Run shortcut trials, one for each row of ``random``.
 
     Args:
-        field: the grid.
+        field: distance field.
         footprint: footprint of the vehicle.
-        layer: extra costs.
-        model: limits and costs.
-        path: changed in place.
-        reach: longest stretch, m.
-        shift: a pose in between moves by up to this share of the stretch.
-        random: shape (n, 6), uniform in 0 to 1.
+        layer: layer of extra costs.
+        model: limits and costs of the vehicle.
+        path: path, changed in place.
+        reach: maximum length of a stretch (m).
+        shift: maximum displacement of the middle pose, as a share of the stretch.
+        random: uniform numbers in 0 to 1, shape (n, 6).
 
     Returns:
-        Number of trials kept.
+        Number of successful trials.
     """
     old, new, word = np.empty((len(path.segments), 3)), np.empty((2 * MAX_SEGMENTS, 3)), np.empty((MAX_SEGMENTS, 3))
     spare, best, scratch = np.empty((len(path.segments) + 12, 3)), np.empty(8), np.empty((4, 3))
@@ -96,7 +96,7 @@ def shortcut(
     kept, cusps = 0, count_cusps(path.segments, path.used[0], 0.0)
     for n in range(len(random)):
         total = path.travelled[path.used[0]]
-        # Short stretches are tried oftener than long ones.
+        # Short stretches are tried more often than long ones.
         length = min(reach, total) * random[n, 0] ** 2 + 0.02
         begin = random[n, 1] * (total + length) - length
         end = min(begin + length, total)
@@ -142,7 +142,8 @@ def shortcut(
         cost += many_cusps_cost(model, others, new_cusps)
         if cost >= present - 1e-6 or not segments_free(field, footprint, model, a, new, many):
             continue
-        # Costs are summed at places along each segment, so a stretch's cost is not quite its share of the route.
+        # Costs are summed at places along each segment, so a stretch's cost differs slightly from its share of the
+        # route.
         used = path.used[0]
         before_trial[:used] = path.segments[:used]
         splice(path, begin, i, end, j, new, many, spare)
@@ -166,19 +167,19 @@ def choose_headings(
     travelled: Array,
     reach: float,
 ) -> Array:
-    """Cheapest free chain of motions over places along a path, the truck facing either way at each.
+    """Find the cheapest free chain of motions over places along a path, with either heading at each place.
 
     Args:
-        field: the grid.
+        field: distance field.
         footprint: footprint of the vehicle.
-        layer: extra costs.
-        model: limits and costs.
-        places: shape (n, 3), poses in the order driven; at the last one the heading is kept.
-        travelled: shape (n,), m.
-        reach: a motion leads at most this far along the path, m.
+        layer: layer of extra costs.
+        model: limits and costs of the vehicle.
+        places: poses in driving order, shape (n, 3); the last one keeps its heading.
+        travelled: distances along the path, shape (n,) (m).
+        reach: maximum length of a motion along the path (m).
 
     Returns:
-        Motion segments, shape (k, 3); none if no chain is free.
+        Motion segments, shape (k, 3); empty if no chain is free.
     """
     n = len(places)
     cost, direction, cusps = np.full((n, 2), inf), np.zeros((n, 2)), np.zeros((n, 2), np.int64)
@@ -194,7 +195,7 @@ def choose_headings(
             if travelled[j] - travelled[i] > reach and i < j - 1:
                 break
             for k in range(4):
-                # At the end the heading is given.
+                # The final heading is given.
                 if j == n - 1 and k >= 2:
                     continue
                 a, b, limit = poses[i, k & 1], poses[j, k >> 1], cost[j, k >> 1] - cost[i, k & 1]
@@ -215,7 +216,7 @@ def choose_headings(
 
 @njit(cache=True)
 def _chain_segments(model: VehicleMotions, poses: Array, before: NDArray[np.int64]) -> Array:
-    """Segments of the chain that ends at the last place."""
+    """Return the segments of the chain that ends at the last place."""
     n = len(poses)
     if before[n - 1, 0] < 0:
         return np.empty((0, 3))
