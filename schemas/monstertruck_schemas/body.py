@@ -6,7 +6,6 @@ bicycle with its ``wheelbase``. ``devices.drive`` is its first driven shaft, ``d
 in this order.
 """
 
-import math
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -18,6 +17,10 @@ Gain = Annotated[float, Field(gt=0, le=10)]
 Coefficient = Annotated[float, Field(ge=-2, le=2)]
 
 
+HalfTurn = Annotated[float, Field(ge=-3.1416, le=3.1416)]
+"""Angle up to half a turn, as people write it (rad)"""
+
+
 class Mount(Schema):
     """Pose of a sensor in the base frame."""
 
@@ -27,11 +30,11 @@ class Mount(Schema):
     """Position left of the base point, m"""
     z: Annotated[float, Field(ge=-2, le=2)] = 0.0
     """Height above the base point, m"""
-    roll: Annotated[float, Field(ge=-math.pi, le=math.pi)] = 0.0
+    roll: HalfTurn = 0.0
     """Rotation about x, rad"""
-    pitch: Annotated[float, Field(ge=-math.pi, le=math.pi)] = 0.0
+    pitch: HalfTurn = 0.0
     """Rotation about y, rad"""
-    yaw: Annotated[float, Field(ge=-math.pi, le=math.pi)] = 0.0
+    yaw: HalfTurn = 0.0
     """Rotation about z, rad"""
 
     @property

@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Final, Self
 import cv2
 import numpy as np
 
+from monstertruck_drivers.scanning.mounting import upright
 from monstertruck_estimation.vision.board import BoardReader
 from monstertruck_estimation.vision.lens import PARAMETERS, Lens, LensFit, fit_lens
 from monstertruck_estimation.vision.tags import Picture
@@ -125,7 +126,7 @@ class CameraWizard:
         devices = context.config.devices
         if devices.lidar is None:
             return None
-        return LidarPlace.of(devices.lidar.mount, *await joint_angles(context))
+        return LidarPlace.of(upright(devices.lidar.mount), *await joint_angles(context))
 
 
 def decoded(message: CompressedImage) -> Picture | None:

@@ -17,6 +17,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
+from monstertruck_drivers.scanning.mounting import hangs
 from monstertruck_estimation.slam.motion import find_offset
 from monstertruck_estimation.slam.registration import Cloud, register
 from monstertruck_estimation.slam.scans import Scan, ScanGeometry, prepare
@@ -182,9 +183,12 @@ class LidarWizard:
         heights = [(await context.ask(step)) / 100 for step in HEIGHTS]
         pitch, roll = beam_tilt(heights, (ahead, left))
         body = tuple(float(np.mean([getattr(a, name) for a in tilt])) for name in ("pitch", "roll"))
+        device = context.config.devices.lidar
+        # the scans of a lidar that hangs are published as those of an upright one
+        hanging = math.pi if device is not None and hangs(device.mount) else 0.0
         found = (
             ("pitch", pitch - body[0] - joints[0], ahead, "nose down positive"),
-            ("roll", roll - body[1] - joints[1], left, "right side down positive"),
+            ("roll", math.remainder(hanging + roll - body[1] - joints[1], math.tau), left, "right side down positive"),
         )
         return tuple(
             estimated(

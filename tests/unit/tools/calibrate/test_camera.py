@@ -324,6 +324,17 @@ async def test_a_lidar_whose_joints_turn_meanwhile_tells_no_mount(session, after
         assert (await CameraWizard()(context)).estimate("pitch") is not None
 
 
+async def test_the_scans_of_a_lidar_that_hangs_are_those_of_an_upright_one(session):
+    context, _, _ = session
+    lidar = context.config.devices.lidar
+    mount = lidar.mount.model_copy(update={"roll": math.pi})
+    devices = context.config.devices.model_copy(update={"lidar": lidar.model_copy(update={"mount": mount})})
+    upright = await CameraWizard()._lidar(context)
+    context.config = context.config.model_copy(update={"devices": devices})
+    hung = await CameraWizard()._lidar(context)
+    assert hung.axes == pytest.approx(upright.axes)
+
+
 def test_a_lidar_that_sends_nothing_is_named_before_everything_else():
     one = guide(beams=lambda view: False)
     for number, view in enumerate(boards(5)):

@@ -106,6 +106,16 @@ async def test_its_mounts_tilt_is_that_of_the_beam_less_the_bodys_and_the_joints
     assert [e.value for e in estimates] == pytest.approx(found, abs=1e-5)
 
 
+async def test_a_lidar_that_hangs_stays_upside_down():
+    context = Level("demo.yaml")
+    lidar = context.config.devices.lidar
+    hung = lidar.model_copy(update={"mount": lidar.mount.model_copy(update={"roll": math.pi})})
+    devices = context.config.devices.model_copy(update={"lidar": hung})
+    context.config = context.config.model_copy(update={"devices": devices})
+    _, roll = await LidarWizard(heights=True)._level(context)
+    assert roll.value == pytest.approx(0.03 - math.pi, abs=1e-5)
+
+
 async def test_a_truck_without_a_compass_is_refused_before_it_drives():
     context = Level("truck.yaml")
     context.config = context.config.model_copy(
