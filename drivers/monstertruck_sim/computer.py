@@ -78,7 +78,7 @@ class EmulatedComputer:
     Args:
         folder: gets proc, sys and dev; must exist.
         devices: devices of the truck.
-        cables: what each device's emulator serves, by role.
+        cables: devices emulated on the cables, by role.
         clock: time.
     """
 

@@ -15,14 +15,14 @@ class DrillConfig(Schema):
     seed: Annotated[int, Field(ge=0)] = 1
     """Which faults, and when"""
     period: Annotated[float, Field(gt=0)] = 10.0
-    """Seconds from one fault to the next, on average"""
+    """Mean interval between faults (s)"""
 
 
 class CeilingCamera(CameraConfig):
-    """A camera of the stand, rendered: it hangs in the map and looks down; engine mujoco only."""
+    """Rendered camera of the stand, fixed in the map and looking down; engine mujoco only."""
 
     port: Path
-    """Link that is made to it; the stand's camera of kind `rendered` names the same"""
+    """Link created for the camera; the stand's camera of kind `rendered` uses the same one"""
     x: float = 0.0
     """Position in the map, m"""
     y: float = 0.0
@@ -30,7 +30,7 @@ class CeilingCamera(CameraConfig):
     height: Annotated[float, Field(gt=0)] = 2.2
     """Over the ground, m"""
     pitch: float = 1.5707963268
-    """Downwards positive, rad: 90 degrees look down, the picture's upper edge is towards `yaw`"""
+    """Downwards positive (rad): at 90 degrees the camera looks down, with the upper edge of the image towards `yaw`"""
     rendered: Literal[True] = True
 
 
@@ -40,13 +40,13 @@ class StandConfig(Schema):
     rate: Annotated[float, Field(gt=0, le=100)] = 20.0
     """Poses a second"""
     position_noise: Annotated[float, Field(ge=0)] = 0.001
-    """Standard deviation of x and of y, m: a camera over the table"""
+    """Standard deviation of x and of y (m), as from a camera over the table"""
     heading_noise: Annotated[float, Field(ge=0)] = 0.01
     """Rad"""
     cameras: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")], CeilingCamera] = Field(default_factory=dict)
     """Cameras of `stand run`, by name"""
     board: HeldBoard | None = None
-    """Board in the pictures by which `stand calibrate` finds their lenses"""
+    """Board in the images with which `stand calibrate` calibrates the lenses"""
 
 
 class SimConfig(Schema):
@@ -57,7 +57,7 @@ class SimConfig(Schema):
     deadman_wired: bool = False
     """The servo controller's deadman output is wired to the drive controller's quick-stop input"""
     servo_timeout: Annotated[float, Field(ge=0, le=10)] = 0.0
-    """Seconds of the servo controller's own serial time-out (0 = off, as delivered)"""
+    """Serial timeout of the servo controller (s); 0 for off, the factory setting"""
     as_built: bool = False
     """What ``world`` does not state of the robot (body, geometry, mounts, servos, motor, pack) follows from the rest of
     the configuration; otherwise the Monstertruck is used"""

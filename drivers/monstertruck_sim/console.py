@@ -125,7 +125,7 @@ def set_line_fault(faults: LineFaults, name: str, value: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class CommandedGroup:
-    """Several things of which a command names one first; with a single thing the name is optional."""
+    """Group of targets that a command addresses by name; the name is optional if there is only one."""
 
     kind: str
     """Noun for the things, for messages."""
@@ -194,7 +194,7 @@ class FaultConsole:
 
 
 def _read(source: int) -> bytes:
-    """What was written meanwhile, a line or more; nothing: it has ended, or the terminal is gone or another's."""
+    """Text written since the last call, at least a line; empty if the terminal has ended or another uses it."""
     try:
         return os.read(source, 65536)
     except OSError:

@@ -1,7 +1,7 @@
-"""Families of faults, generated from the emulated devices' own signals: every way to falsify every one of them.
+"""Fault families generated from the emulated devices' own signals: every way to falsify each signal.
 
-The catalog in ``faults`` lists what is known to happen. Nothing is listed here: a device that names its signals has its
-families, plug-ins included.
+The catalog in ``faults`` lists known faults. This module lists none: every device that declares its signals, plug-ins
+included, gets its families.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -18,7 +18,7 @@ MESSAGE: Final = "message"
 """Stands for all signals of a device: its messages as a whole."""
 
 Draw = Callable[[np.random.Generator, float], float]
-"""Argument of a fault of a signal whose greatest magnitude so far is the second argument."""
+"""Argument of a signal's fault, computed from the signal and its greatest magnitude so far."""
 
 
 def _of_extent(least: float, greatest: float, *, signed: bool = False) -> Draw:
@@ -63,7 +63,7 @@ MESSAGES: Final[Mapping[str, Draw]] = {
     "double_rate": _between(0.1, 1.0),
     "delay": _between(0.02, 0.5),
 }
-"""Faults of whole messages: what the cable's console calls them."""
+"""Faults of whole messages, by their names on the cable's console."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +105,7 @@ def families(robot: SimulatedRobot, *, used: bool = False) -> tuple[Family, ...]
 
     Args:
         robot: the robot.
-        used: only of signals that its drivers have read or given so far; the others change nothing.
+        used: restrict to signals that drivers have read or written so far; faults in others have no effect.
     """
 
     def of(devices: Mapping[str, Any]) -> Iterator[Family]:

@@ -38,13 +38,13 @@ SERIAL: Final = (
 )
 """Roles of devices whose kinds are on a serial line, most of them."""
 VITAL: Final = ("drive", "steering", "lidar", "lidar_2", "compass", *MORE_DRIVES, "wheels", "actuators", "sonar")
-"""The robot stops when one of these sends nothing; the sonars where they guard it, without a lidar."""
+"""Roles whose silence stops the robot; the sonars only as its guard, without a lidar."""
 SHORT_WRITES: Final = 19
 """Maximum number of consecutive writes cut in half."""
 ALL_ROUND: Final = "-135 135"
 """Directions of all the lidar's beams, degrees."""
 UNKNOWN_CODES: Final = (*range(3, 20),)
-"""The lidar's codes of beams that say nothing; 0 to 2 say that nothing is in its range."""
+"""Codes of the lidar for beams without information; 0 to 2 mean no return within range."""
 
 
 class FaultKind(StrEnum):
@@ -100,7 +100,7 @@ class ComputerPower(Protocol):
     """The supply of the computer that a daemon runs on."""
 
     async def cut(self) -> None:
-        """The daemon is gone at once; cables that lead to it must be dead before."""
+        """End the daemon at once; cables to it must be dead before."""
 
     def give(self) -> None:
         """The computer has started, and with it a new daemon."""
@@ -110,7 +110,7 @@ class Workers(Protocol):
     """Worker processes of a daemon."""
 
     def kill(self, name: str) -> None:
-        """End a worker as SIGKILL does, and wait until it is dead; nothing if it does not run."""
+        """Kill a worker as SIGKILL does, and wait for its end; no effect if it does not run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +123,7 @@ class SimContext:
         robot: world and emulators.
         computer: USB tree and cables.
         clock: time.
-        disk: None where nothing records.
+        disk: disk of the recording; None without a recorder.
         power: None where the computer is this one.
         workers: None where no fault acts on them.
     """
@@ -153,13 +153,13 @@ class SimContext:
         return signals
 
     def command(self, role: str, *lines: str) -> None:
-        """Give commands of the fault console to a device; nothing where the truck has none."""
+        """Send fault console commands to a device; no effect if the truck lacks it."""
         if role in self.robot.emulators:
             for line in lines:
                 self.device(role).command(line.split())
 
     def monitored(self, name: str, fault: str, *values: str) -> None:
-        """Change the readings of a monitor; do nothing if the truck has no monitor of that name."""
+        """Change the readings of a monitor; no effect if the truck lacks it."""
         if name in self.robot.monitored:
             self.robot.monitored[name].inject(fault, *values)
 
@@ -173,7 +173,7 @@ class SimContext:
 
         Args:
             hubs: names.
-            enumerated: all behind them is there at once, as for a computer that has started.
+            enumerated: whether all devices behind the hub are present at once, as after a start of the computer.
         """
         times = {"first": 0.0, "between": 0.0} if enumerated else {}
         usb, clock = self.computer.usb, self.clock
@@ -207,7 +207,7 @@ def nothing(_: SimContext) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Fault(Generic[C]):
-    """Something that goes wrong for a while.
+    """A temporary fault.
 
     Args:
         name: for reports.
@@ -236,7 +236,7 @@ def monitored(name: str, fault: str, *values: str) -> Action[SimContext]:
 
 
 def exchange_cables(one: str, other: str) -> Action[SimContext]:
-    """Each device's cable in the other's port; the same again undoes it."""
+    """Swap two devices' cables between their ports; a second call undoes it."""
     return lambda context: context.exchange_cables(one, other)
 
 
@@ -275,7 +275,7 @@ class CatalogFault(Fault[SimContext]):
     Args:
         kind: kind of its kind.
         must_stop: the truck must stand soon, and stay so.
-        disarms: once it stands, it must not start again by itself.
+        disarms: whether the fault must disarm the robot, which must not start again by itself.
     """
 
     kind: FaultKind
@@ -305,7 +305,8 @@ class FaultCatalog:
         records: whether its daemon writes a log.
         restarts: whether its computer can be switched off.
         workers: names of its daemon's worker processes.
-        unguarded: roles of motor controllers that nothing stops while they cannot be reached: nothing cuts them off.
+        unguarded: roles of motor controllers without any device that stops them while they are unreachable; they are
+            never disconnected.
     """
 
     def __init__(
@@ -486,7 +487,7 @@ def _noise(rng: np.random.Generator) -> str:
 
 
 def _held_wheel(rng: np.random.Generator, motors: int) -> CatalogFault:
-    """A stepper that is held loses steps, and nothing reports it."""
+    """A stepper that is held loses steps without reporting it."""
     motor = int(rng.integers(motors)) + 1
     return _cable(rng, FaultKind.HELD_WHEEL, "wheels", *_switch(f"overload {motor}"))
 
@@ -503,7 +504,7 @@ def _encoder(rng: np.random.Generator, kind: FaultKind, fault: str) -> CatalogFa
 
 
 def _cross_talk(rng: np.random.Generator, name: str) -> CatalogFault:
-    """The sound of another sonar: an echo from a distance where nothing is."""
+    """Sound of another sonar: an echo from a distance without an object."""
     metres = rng.uniform(0.15, 3.0)
     starts, ends = command("sonar", f"ghost {name} {metres:.2f}"), command("sonar", f"ghost {name} off")
     return _fault(FaultKind.CROSS_TALK, f"{name}, {metres:.2f} m", starts, ends, _hold(rng))
@@ -525,7 +526,7 @@ def _slow(rng: np.random.Generator, role: str) -> CatalogFault:
 
 
 def _short_write(rng: np.random.Generator, role: str, guarded: Collection[str]) -> CatalogFault:
-    """Many in a row cut a controller off: one that nothing stops meanwhile has few."""
+    """Many in a row disconnect a controller, so an unguarded controller gets few."""
     most = SHORT_WRITES if role in guarded else BRIEF_SILENCES
     start, end = (f"line short_writes {rng.integers(1, most + 1)}",), ("line short_writes 0",)
     return _cable(rng, FaultKind.SHORT_WRITE, role, start, end)

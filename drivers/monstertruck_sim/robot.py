@@ -22,7 +22,7 @@ from monstertruck_sim.world.world import World
 
 
 def carries_lidar(devices: Devices) -> bool:
-    """Whether a lidar's weight is on the robot, or at least that of the mount that turns one."""
+    """Whether the robot carries the weight of a lidar, or at least of its turning mount."""
     return devices.lidar is not None or devices.stabiliser is not None
 
 
@@ -32,7 +32,7 @@ class SimulatedRobot:
     Args:
         config: the simulated side's settings.
         devices: the robot's, with their settings.
-        monitors: what of the computer is watched.
+        monitors: monitored quantities of the computer.
         clock: time of world and devices.
         ports: one emulated port per device role; ``run`` plugs them in.
         root: folder of the emulated computer, for its monitors.

@@ -1,4 +1,4 @@
-"""A LiPo pack: charge by coulomb counting, sag at once and slowly, read through a divider and an RC filter."""
+"""LiPo pack: coulomb counting, immediate and slow sag, read through a divider and an RC filter."""
 
 from math import exp
 
@@ -35,7 +35,7 @@ class BatteryModel:
         self._filtered = self.volts
 
     def set_charge(self, charge: float) -> None:
-        """Exchange the pack for one of another charge, 0..1."""
+        """Replace the pack by one with another charge, 0..1."""
         self.charge = charge
         self._rest = rest_voltage(charge, self._config.cells)
         self.volts = self._loaded(self._config.electronics_w / self._rest)

@@ -24,14 +24,14 @@ _WALL = 0.1
 
 
 class RoundedRectangle(NamedTuple):
-    """A lap around the origin, between the outer ends of its straights and arcs, m."""
+    """Length of a lap around the origin between the outer ends of its straights and arcs (m)."""
 
     length: float
     width: float
     radius: float
 
     def distances(self, canvas: "_Canvas") -> Array:
-        """Distance of every cell from the lap's inner straight core, less the radius, m: 0 on the lap."""
+        """Distance of every cell from the lap's inner straight core, minus the radius (m): 0 on the lap."""
         dx = np.maximum(abs(canvas.xs) - (self.length / 2 - self.radius), 0)
         dy = np.maximum(abs(canvas.ys) - (self.width / 2 - self.radius), 0)
         away: Array = np.hypot(dx, dy) - self.radius
@@ -65,8 +65,8 @@ class _Canvas:
     """Free space on solid rock, drawn in metres; finally only a skin of the rock is kept as wall.
 
     Args:
-        x: lower and upper bound, m.
-        y: the same.
+        x: lower and upper bound (m).
+        y: lower and upper bound (m).
     """
 
     def __init__(self, x: tuple[float, float], y: tuple[float, float]) -> None:
@@ -180,7 +180,7 @@ def yard() -> BuiltIn:
 
 
 def hall() -> BuiltIn:
-    """A hall, 11 m x 6 m, with posts and niches along its walls: what is in it is the ground's business."""
+    """A hall, 11 m x 6 m, with posts and niches along its walls; the ground profile adds its contents."""
     canvas = _Canvas((-1.4, 10.4), (-3.5, 3.5))
     canvas.free = canvas.rectangle(-1.0, -3.0, 10.0, 3.0)
     for niche in ((0.5, 2.9, 1.4, 3.3), (6.0, 2.9, 6.5, 3.2), (3.0, -3.3, 4.2, -2.9), (9.9, -1.6, 10.3, -0.4)):
@@ -229,7 +229,7 @@ def lap(shape: RoundedRectangle = LOOP, spacing: float = 0.05) -> Array:
 
     Args:
         shape: shape of the lap.
-        spacing: wanted distance of the points, m; the true one divides the lap evenly.
+        spacing: approximate distance of the points (m); the actual one divides the lap evenly.
 
     Returns:
         (n, 3): x, y (m) and heading (rad, in (-pi, pi]) in the map frame; the last row repeats the first.
@@ -262,7 +262,7 @@ def _along(x: float, y: float, yaw: float, s: Array, curvature: float) -> tuple[
 
 
 def make_worlds(out: Path) -> list[Path]:
-    """Write ``out``/worlds/NAME.yaml, .png, .profile.yaml and the laps in ``out``/paths; returns what was written."""
+    """Write ``out``/worlds/NAME.yaml, .png, .profile.yaml and the laps in ``out``/paths; return the written files."""
     worlds, paths = out / "worlds", out / "paths"
     worlds.mkdir(parents=True, exist_ok=True)
     paths.mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,7 @@
 """View of the truck's camera in the plane: walls as columns, tags and people as flat panels, through a lens.
 
-A pixel's ray follows the camera's true lens (radial distortion as of Brown) and mount; the ground is level. A panel
-is sampled by several rays in each pixel, so that a far tag blurs as it does on a real sensor.
+A pixel's ray follows the camera's true lens (Brown's radial distortion) and mount; the ground is level. A panel is
+sampled by several rays per pixel, so that a distant tag blurs as on a real sensor.
 """
 
 from collections.abc import Callable, Sequence
@@ -41,7 +41,7 @@ class CameraPlace(NamedTuple):
     """Pose of the camera at an instant."""
 
     centre: Array
-    """(3,): of the lens, in the map and over the ground, m."""
+    """Position of the lens, (3,): in the map and above the ground (m)."""
     axes: Array
     """(3, 3), rows: its right, its down and its axis, in the map."""
 
@@ -54,14 +54,13 @@ class FlatPanel(NamedTuple):
     opaque: NDArray[np.bool_]
     """(rows, columns)."""
     corner: Array
-    """(3,): its upper left corner, m."""
+    """Upper left corner, (3,) (m)."""
     right: Array
-    """(3,): its upper edge, m."""
+    """Upper edge, (3,) (m)."""
     down: Array
-    """(3,): its left edge, m."""
+    """Left edge, (3,) (m)."""
     smooth: bool = False
-    """Sampled between its own pixels (OpenCV), and twice a pixel of the picture along and across at least, so that its
-    edges are where they are to a small part of a pixel."""
+    """Whether to interpolate between its pixels (OpenCV), with two samples per image pixel each way: exact edges."""
 
 
 class Holder(Protocol):
@@ -121,7 +120,7 @@ class SimulatedView:
         self._panels = [tag_panel(tag) for tag in tags]
 
     def ranges(self, time_ns: int, angles: Array) -> Array:
-        """Horizontal distances, m, at ``time_ns`` along ``angles`` from the truck's axis; inf = nothing; (n,)."""
+        """Return the distances at ``time_ns`` along ``angles`` from the truck's axis, (n,) (m); inf without a hit."""
         self.plant.advance(time_ns)
         x, y, yaw = self.plant.poses(np.array([time_ns]))[:3, 0]
         c, s = cos(yaw), sin(yaw)
@@ -131,7 +130,7 @@ class SimulatedView:
         return self._cast(xs, ys, yaw + angles, self.config.reach)
 
     def exposure(self, time_ns: int, size: tuple[int, int]) -> Drawing:
-        """``ViewSource``: asks the world at once, draws when called."""
+        """``ViewSource`` that reads the world at once and draws when called."""
         painter = self._painter(size)
         ranges = self.ranges(time_ns, painter.azimuths)
         place = self._place(time_ns)
@@ -157,7 +156,7 @@ class SimulatedView:
         return self._painters[size]
 
     def sensor(self, time_ns: int) -> Callable[[Picture], Picture]:
-        """Return what light, lens and sensor make of a drawn picture at an instant."""
+        """Apply the effects of light, lens and sensor at an instant to a drawn image."""
         config, seed = self.config, self._seed
         if seed is None or not config.noise:
             return lambda picture: lit(picture, config)
@@ -170,14 +169,14 @@ class SimulatedView:
         for panel in self._panels:
             away = panel.corner + (panel.right + panel.down) / 2 - place.centre
             front = np.cross(panel.down, panel.right)
-            # 12.0: panels further away are not drawn, m: a tag of 10 cm is 4 pixels there
+            # 12.0: maximum distance of drawn panels, m: there a tag of 10 cm has 4 pixels
             if away @ place.axes[2] > 0.05 and away @ front < 0 and (far := float(np.linalg.norm(away))) < 12.0:
                 found.append((far, panel))
         return [panel for _, panel in sorted(found, key=lambda row: -row[0])]
 
 
 class Painter:
-    """Draws pictures of one size; stateless, so that threads may share it.
+    """Draw images of one size; stateless, so that threads may share it.
 
     Args:
         config: lens and mount.
@@ -211,7 +210,7 @@ class Painter:
             self._along = np.cos(fan).astype(np.float32)
         self._fan = fan
         self.azimuths: Array = fan + config.yaw
-        """Directions of the needed ranges, from the robot's axis, rad; falling."""
+        """Directions of the required ranges from the robot's axis, falling (rad)."""
         depth = np.minimum(np.abs(slope) * self._focal / (height / 2), 1.0) * 63
         ground = (np.where(slope > 0, FLOOR, SKY) + depth).astype(np.uint8)
         self._column, self._slope, self._ground = (
@@ -224,7 +223,7 @@ class Painter:
         """Draw.
 
         Args:
-            ranges: (n,) horizontal distance along each of ``azimuths``, m; inf = nothing.
+            ranges: horizontal distance along each of ``azimuths``, (n,) (m); inf without a hit.
             panels: the last one on top.
             place: place of the camera.
         """
@@ -245,13 +244,13 @@ class Painter:
         width, height = self._size
         flat, edge = seen[:, :2] / seen[:, 2:], 1.3 * width / 2 / self._focal
         at = self._bent(*np.clip(flat, -edge, edge).T) * self._focal + np.array(((width - 1) / 2, (height - 1) / 2))
-        at = np.where(np.abs(flat) > edge, np.sign(flat) * 2 * width, at)  # far outside a lens's terms mean nothing
+        at = np.where(np.abs(flat) > edge, np.sign(flat) * 2 * width, at)  # the lens's terms are invalid far outside
         (x0, y0), (x1, y1) = np.floor(at.min(axis=0)).astype(int) - 1, np.ceil(at.max(axis=0)).astype(int) + 2
         x0, y0, x1, y1 = max(int(x0), 0), max(int(y0), 0), min(int(x1), width), min(int(y1), height)
         if x0 >= x1 or y0 >= y1:
             return
-        # 4: rays of a pixel along and across, at most
-        # 80_000: rays of a panel at most: fewer rays a pixel where it fills the picture
+        # 4: maximum rays per pixel, along and across 80_000: maximum rays per panel; a panel that fills the image has
+        # fewer rays per pixel
         finer = max(1 + panel.smooth, min(4, int((80_000 / ((x1 - x0) * (y1 - y0))) ** 0.5)))
         part = (np.arange(finer) + 0.5) / finer - 0.5
         us = (np.arange(x0, x1)[:, None] + part).ravel() - (width - 1) / 2
@@ -278,18 +277,18 @@ class Painter:
         window[:] = np.rint(colours + (1 - share) * window).astype(np.uint8)
 
     def _unhidden(self, points: Array, place: CameraPlace, ranges: Array) -> NDArray[np.bool_]:
-        """Which points, from the camera in the map's axes, nothing stands before."""
+        """Mark the points, relative to the camera in the map's axes, that no wall hides."""
         axis = place.axes[2]
         ahead = np.arctan2(axis[1], axis[0])
         azimuths = np.angle(np.exp(1j * (np.arctan2(points[..., 1], points[..., 0]) - ahead)))
         fan = self._fan
         at = np.clip(np.searchsorted(-fan, -azimuths), 0, len(fan) - 1)
-        # 0.08: a panel up to this far behind a wall hangs on it, so it is drawn before it, m
+        # 0.08: maximum depth of a panel behind a wall that carries it, m; it is drawn in front of the wall
         found: NDArray[np.bool_] = np.hypot(points[..., 0], points[..., 1]) < ranges[at] + 0.08
         return found
 
     def straight_pixels(self) -> tuple[float, Array]:
-        """How much wider a picture without distortion has to be, and where in it every pixel lies, (h, w, 2).
+        """Return the required scale of an image without distortion, and the place of every pixel in it, (h, w, 2).
 
         The wider one has as many pixels.
         """
@@ -336,7 +335,7 @@ def _between(texture: NDArray[np.uint8], across: Array, along: Array) -> NDArray
 
 
 def opencv(key: str) -> Any:
-    """OpenCV, for what ``key`` of the configuration wants drawn.
+    """Import OpenCV, which drawing the configuration's ``key`` requires.
 
     Raises:
         NotInstalledError: the extra ``vision`` is not there.
@@ -435,7 +434,7 @@ def _grainy(picture: Picture, seed: int, noise: float, row: int, column: int) ->
 
 @njit(cache=True)
 def _added(picture: Picture, grain: NDArray[np.int16], row: int, column: int) -> Picture:
-    """Add the part of the grain that begins at (row, column), the same in all colours."""
+    """Add the tile of the grain that begins at (row, column), equal in all colours."""
     height, width, colours = picture.shape
     noisy = np.empty_like(picture)
     for i in range(height):

@@ -370,18 +370,18 @@ class TagConfig(Schema):
 
 
 class ChargerConfig(Schema):
-    """Charging contacts on the ground, too low for lidar and camera, and the robot's pose at which they close."""
+    """Charging contacts on the ground, too low for lidar and camera, with the robot's pose for charging."""
 
     x: float
     """x of the robot's geometric centre on the contacts, m."""
     y: float
-    """y of the same, m."""
+    """y of the robot's geometric centre on the contacts (m)."""
     yaw: float = 0.0
     """Heading of the robot, rad."""
     tolerance: Positive = 0.015
-    """Maximum distance from that pose at which the contacts close, m."""
+    """Maximum distance from that pose for closed contacts (m)."""
     turn_tolerance: Positive = 0.035
-    """Maximum difference in heading at which they close, rad."""
+    """Maximum heading error for closed contacts (rad)."""
     current: NotNegative = 3.0
     """Charging current, A; 0: the charger is off."""
 

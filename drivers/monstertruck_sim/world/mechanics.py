@@ -64,7 +64,7 @@ def description(
     sensors: tuple[SensorFrame, ...] = (),
     head: LidarHead | None = None,
 ) -> Description:
-    """Of the robot of a body, one of ``SOLID_BODIES``.
+    """Return the mechanics of a robot with a body of ``SOLID_BODIES``.
 
     Args:
         truck: body and dimensions.

@@ -53,7 +53,7 @@ def discs_and_segments(obstacles: Iterable[Obstacle]) -> tuple[Array, Array]:
 
 
 def penetration(footprint: Box, obstacle: Obstacle) -> float:
-    """How deep a footprint reaches into an obstacle, m; 0 if they are apart."""
+    """Return the depth of a footprint's overlap with an obstacle (m); 0 if they are apart."""
     if isinstance(obstacle, Disc):
         return _disc_penetration(footprint, obstacle)
     return _box_penetration(footprint.corners(), obstacle.corners())

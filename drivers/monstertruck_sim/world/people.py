@@ -1,4 +1,4 @@
-"""People who walk through the world from way-point to way-point, modelled as upright cylinders."""
+"""People walking through the world between way-points, modelled as upright cylinders."""
 
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -117,7 +117,7 @@ class Person:
                 self._waited = 0.0
                 return
         self._waited += STEP_S
-        if self._waited > 3.0:  # longest wait for another body before another way-point is chosen, s
+        if self._waited > 3.0:  # maximum wait for another body before a different way-point is chosen, s
             self._waited = 0.0
             self._turn_back()
 

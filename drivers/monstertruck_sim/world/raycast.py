@@ -129,17 +129,17 @@ def cast_rays(
     discs: Array,
     segments: Array,
 ) -> Array:
-    """Distance of the first thing each ray meets, m; inf if nothing is within ``reach``.
+    """Return the distance to the first hit of each ray (m); inf without a hit within ``reach``.
 
     Args:
         clear: ``clearance`` of the grid, (rows, columns), row 0 lowest y; outside the grid is free.
         resolution: cell side, m.
         origin_x: x of the grid's lower left corner in the map frame, m.
-        origin_y: y of the same corner, m.
+        origin_y: y of the grid's lower left corner in the map frame (m).
         xs: (n,) ray origins in the map frame, m: one per ray, so that a sensor may move during its sweep.
         ys: (n,) as ``xs``.
         angles: (n,) ray directions in the map frame, rad.
-        reach: greatest distance looked at, m.
+        reach: maximum distance (m).
         discs: (k, 3) of x, y, radius in the map frame, m.
         segments: (m, 4) of x0, y0, x1, y1 in the map frame, m.
 
@@ -164,7 +164,7 @@ def cast_rays(
 def grid_penetration(
     occupied: NDArray[np.bool_], resolution: float, x: float, y: float, yaw: float, length: float, width: float
 ) -> float:
-    """Sum over occupied cells of how deep a rectangle reaches into each, m; 0 if it touches none.
+    """Return the sum of a rectangle's overlap depths over all occupied cells (m); 0 without contact.
 
     Args:
         occupied: (rows, columns), row 0 lowest y.

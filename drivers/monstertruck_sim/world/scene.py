@@ -25,7 +25,7 @@ from monstertruck_sim.world.raycast import cast_rays, clearance, grid_penetratio
 from monstertruck_sim.world.truck_plant import STEP_NS
 
 MOVING = 0.01
-"""Speed below which a body counts as standing (m/s)."""
+"""Maximum speed of a body at rest (m/s)."""
 _WALK_NS = round(STEP_S * 1e9)
 
 
@@ -60,7 +60,7 @@ class Neighbour(Protocol):
 
     @property
     def pace(self) -> float:
-        """Speed of its fastest point, m/s."""
+        """Speed of the body's fastest point (m/s)."""
 
     def integrate(self, time_ns: int) -> None:
         """Move on to an instant; the first call sets the start."""
@@ -159,11 +159,11 @@ class Surroundings:
     # Contact
 
     def fixed_overlap(self, box: Box) -> float:
-        """How deep a footprint reaches into map and obstacles, m; 0 = free."""
+        """Return the depth of a footprint's overlap with map and obstacles (m); 0 without contact."""
         return self.overlap(self._occupied, box) + sum(penetration(box, obstacle) for obstacle in self._obstacles)
 
     def overlap(self, solid: NDArray[np.bool_], box: Box) -> float:
-        """How deep a footprint reaches into cells, m."""
+        """Return the depth of a footprint's overlap with cells (m)."""
         x0, y0 = self.map.origin
         depth: float = grid_penetration(
             solid, self.map.resolution, box.x - x0, box.y - y0, box.yaw, box.length, box.width
@@ -171,7 +171,7 @@ class Surroundings:
         return depth
 
     def moving_overlap(self, box: Box, name: str) -> float:
-        """How deep the footprint of the robot ``name`` would reach into the other robots and into people, m."""
+        """Return the depth of overlap of the robot ``name``'s footprint with other robots and people (m)."""
         return sum(depth for _, _, depth in self._met(box, name))
 
     def report(self, box: Box, name: str, speed: float) -> None:
@@ -208,7 +208,7 @@ class Surroundings:
     def _part(self) -> None:
         """Forget pairs that are apart: if they meet again, it is another contact."""
         for pair in sorted(self._touching):
-            # 0.08: two bodies that are further apart have parted, m: more than a stride
+            # 0.08: minimum distance of bodies that have parted, m: more than a stride
             first, second = (self._shape(name, 2 * 0.08) for name in pair)
             box, other = (first, second) if isinstance(first, Box) else (second, first)
             if isinstance(box, Box) and penetration(box, other) == 0.0:
@@ -268,7 +268,7 @@ class Surroundings:
             angles: (n,) directions in the map frame, rad.
             reach: m.
             times_ns: (n,) instants of the rays, rising: the others are met where they were then; None: now.
-            without: name of the robot that looks.
+            without: name of the robot with the sensor.
         """
         others = [body for body in self.bodies if body.name != without]
         if not others and not self.people:

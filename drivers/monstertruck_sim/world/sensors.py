@@ -48,7 +48,7 @@ URG_SHEET = RangeSheet(0.02, 5.6, 0.01, 0.01)
 SWEEP_STEPS = 769
 SWEEP_NS = 100_000_000
 NO_RETURN, TOO_NEAR, FAILED = 0, 6, 19
-"""Error codes of the scanner: nothing there; other error (never "free"); step cannot be measured."""
+"""Error codes of the scanner: no return; other error (never "free"); step not measurable."""
 BEAM_ANGLES = (np.arange(SWEEP_STEPS) - 384) * (2 * pi / 1024)
 _BEAM_DELAYS = (np.arange(SWEEP_STEPS) * (SWEEP_NS // 1024)).astype(np.int64)
 
@@ -61,13 +61,13 @@ class Sweep(Protocol):
     """Beams of a lidar through the world."""
 
     def __call__(self, poses: Array, beams: Beams | None, times_ns: NDArray[np.int64], reach: float, /) -> Array:
-        """Ranges, m; inf = nothing.
+        """Ranges (m); inf without a return.
 
         Args:
             poses: poses of the robot at the beams' instants, (6, n): x, y, yaw, pitch, roll, height.
             beams: directions in the body frame; None: ``BEAM_ANGLES`` in the body's plane.
             times_ns: instants of the beams, (n,), rising.
-            reach: greatest horizontal distance looked at, m.
+            reach: maximum horizontal distance (m).
         """
 
 
@@ -75,7 +75,7 @@ class UnevenGround(Protocol):
     """Ground with a height."""
 
     def height(self, x: Array, y: Array) -> Array:
-        """Metres at points in the map frame; all of one shape."""
+        """Return the heights at points in the map frame (m); all arrays have one shape."""
 
     def cast(self, xs: Array, ys: Array, zs: Array, headings: Array, rises: Array, reach: float) -> Array:
         """Horizontal distances along beams from points; inf beyond ``reach``; all (n,)."""
@@ -100,7 +100,7 @@ class PlaneSweep:
         """Implements ``Sweep``."""
         x, y, yaw, pitch, roll, _ = poses
         xs, ys = self._places(x, y, yaw)
-        # 1e-4: tilt of a level robot at most, rad
+        # 1e-4: maximum tilt of a level robot, rad
         if beams is None and self._terrain is None and np.abs(poses[3:5]).max() < 1e-4:
             return self._cast(xs, ys, yaw + BEAM_ANGLES, reach, times_ns)
         beams = turned(LEVEL_BEAMS if beams is None else beams, pitch, roll)
@@ -145,7 +145,7 @@ def over(
     times_ns: NDArray[np.int64],
     reach: float,
 ) -> Array:
-    """Ranges over uneven ground to it and to walls that stand on it, m; inf = nothing.
+    """Return ranges over uneven ground, to the ground and the walls on it (m); inf without a return.
 
     Args:
         cast: horizontal ranges to the walls.
@@ -155,7 +155,7 @@ def over(
         yaw: yaw of the robot, (n,).
         beams: directions in the robot's level frame.
         times_ns: instants of the beams.
-        reach: greatest horizontal distance looked at, m.
+        reach: maximum horizontal distance (m).
     """
     (xs, ys, zs), (forward, left, up) = origins, beams
     level = np.hypot(forward, left)
@@ -195,8 +195,8 @@ class SimulatedLidar:
     def scan(self, time_ns: int) -> NDArray[np.int32]:
         """Distances in mm of the revolution that began at ``time_ns``, (769,); codes below 20 are errors.
 
-        Ask once it is over (within half a second) for exact poses; asked earlier, the truck's motion during the
-        sweep is extrapolated.
+        Call it up to half a second after the sweep for exact poses; an earlier call extrapolates the truck's motion
+        during the sweep.
         """
         self._plant.advance(time_ns)
         sheet = self._sheet(URG_SHEET)
@@ -224,7 +224,7 @@ class SimulatedLidar:
         return sheet._replace(least=least, greatest=config.max_range or sheet.greatest)
 
     def _cast(self, mounted: Beams | None, level: Beams, times: NDArray[np.int64], reach: float) -> Array:
-        """True ranges, (n,), m, of beams in the frame of the lidar's carrier; ``mounted`` None: ``LEVEL_BEAMS``."""
+        """Return the true ranges, (n,) (m), of beams in the frame of the lidar's carrier; None: ``LEVEL_BEAMS``."""
         poses, beams = self._plant.poses(times), mounted
         if self.joints is not None:
             beams = turned(level if beams is None else beams, *self.joints.angles(times))
@@ -234,13 +234,13 @@ class SimulatedLidar:
         return ranges
 
     def _sigma(self, ranges: Array, sheet: RangeSheet) -> Array:
-        """Standard deviations, (n,), m; 0 where there is no range."""
+        """Return the standard deviations, (n,) (m); 0 without a return."""
         met = np.where(np.isfinite(ranges), ranges, 0.0)
         sigma = np.maximum(sheet.error, sheet.relative_error * met) / self._config.accuracy_sigmas
         return np.where(np.isfinite(ranges), sigma, 0.0)
 
     def _held(self, board: FlatPanel, pose: Array, beams: Beams) -> Array:
-        """Ranges of a board before a robot that stands, m; inf = none."""
+        """Return the ranges of a board in front of a robot at rest (m); inf without a return."""
         x, y, yaw, pitch, roll, height = pose.tolist()
         body, config = rotation(yaw, pitch, roll), self._config
         origin = np.array((x, y, height)) + body @ np.array((config.x, config.y, config.height))
@@ -261,7 +261,7 @@ class SimulatedLidar:
 
 
 class SimulatedMotor:
-    """``MotorPlant``: one of the driven shafts in the controller's own sign."""
+    """``MotorPlant`` of one driven shaft, with the controller's sign."""
 
     def __init__(self, plant: Plant, config: MotorConfig, seed: int | None, shaft: int = 0) -> None:
         self._plant, self._config, self._shaft = plant, config, shaft
@@ -315,7 +315,7 @@ class SimulatedServos:
         self._plant.advance(time_ns)
 
     def analog_volts(self, channel: int, time_ns: int) -> float:
-        """Voltage at an analog input; 0 at all but the battery's and that of its current."""
+        """Return the voltage at an analog input; 0 except at the inputs of battery voltage and current."""
         config, battery = self._config, self._plant.battery
         if channel not in (config.channel, config.current_channel):
             return 0.0
@@ -331,10 +331,10 @@ class SimulatedServos:
 class SimulatedCompass:
     """``AttitudeSource``: a magnetometer and an accelerometer on the body, axes x forward, y left, z up.
 
-    The accelerometer feels the reaction to gravity and to the body's own acceleration, and pitch and roll are what it
-    takes for the vertical. The level field is turned by the deviation curve and by noise, tilted with the body,
-    distorted by the truck's iron and by the motor's current; the heading is what a compensation by the true tilt makes
-    of it: errors of the heading while the body accelerates are not modelled.
+    The accelerometer measures the reaction to gravity and to the body's own acceleration, from which the compass
+    computes pitch and roll. The level field is rotated by the deviation curve and noise, tilted with the body, and
+    distorted by the truck's iron and the motor's current. The heading is compensated with the true tilt: heading errors
+    of an accelerating body are not modelled.
     """
 
     def __init__(self, plant: Plant, config: CompassModelConfig, seed: int | None) -> None:
@@ -349,7 +349,7 @@ class SimulatedCompass:
             self._deviation = radians(config.deviation_deg)
 
     def deviation(self, heading: float) -> float:
-        """Fixed heading error, rad: a one-cycle and a two-cycle wave, together at most the configured amplitude."""
+        """Return the fixed heading error (rad): a one-cycle and a two-cycle wave, within the configured amplitude."""
         one, two = heading + self._phases[0], 2 * heading + self._phases[1]
         return self._deviation * (0.6 * sin(one) + 0.4 * sin(two))
 
@@ -444,7 +444,7 @@ class SimulatedRearWheels:
         self._rolled = [0.0, 0.0]
 
     def wheels(self, time_ns: int) -> tuple[float, float]:
-        """Angles at ``time_ns``, rad."""
+        """Return the angles at ``time_ns`` (rad)."""
         self._plant.advance(time_ns)
         x, y, yaw = self._plant.pose
         if self._pose is not None:
@@ -453,9 +453,9 @@ class SimulatedRearWheels:
         return self._rolled[0] / self._radius, self._rolled[1] / self._radius
 
     def _roll(self, before: Pose2, now: Pose2, dt: int) -> None:
-        """Add the motion along an arc; nothing where the robot was carried."""
+        """Add the motion along an arc; skip it if the robot was carried."""
         way = hypot(now[0] - before[0], now[1] - before[1])
-        if way > 5.0 * dt / SECOND:  # a robot that was faster than this between two looks was carried, m/s
+        if way > 5.0 * dt / SECOND:  # maximum speed between two samples of a robot that was not carried, m/s
             return
         turn, middle = now[2] - before[2], (now[2] + before[2]) / 2
         chord = (now[0] - before[0]) * cos(middle) + (now[1] - before[1]) * sin(middle)

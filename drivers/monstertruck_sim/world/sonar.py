@@ -1,11 +1,10 @@
 """Sonar model: pure functions of the surrounding walls, for emulators and for studies without a daemon.
 
-``beam`` is the range along the axis. ``cone`` samples the cone by rays and takes the nearest point that returns sound:
-a wall returns it where its normal is within the critical angle of the direction to the sonar, an edge or a corner
-from everywhere. Sound from another sonar arrives in the same manner, over a longer or shorter path, shifted by the
-difference in send time: a sonar cannot tell the source of a sound (after Kuc and Siegel, "Physically Based Simulation
-Model for Acoustic Sensor Robot Navigation", 1987; Borenstein and Koren, "Error Eliminating Rapid Ultrasonic Firing",
-1995).
+``beam`` is the range along the axis. ``cone`` samples the cone by rays and uses the nearest point that returns sound: a
+wall if its normal is within the critical angle of the direction to the sonar, an edge or a corner in every direction.
+Sound from another sonar arrives in the same manner, over a longer or shorter path, shifted by the difference in send
+time: a sonar cannot identify the source of a sound (after Kuc and Siegel, "Physically Based Simulation Model for
+Acoustic Sensor Robot Navigation", 1987; Borenstein and Koren, "Error Eliminating Rapid Ultrasonic Firing", 1995).
 """
 
 from collections import deque
@@ -84,10 +83,10 @@ def leaning(cast: Caster, yaw: float, pitch: float, roll: float, over: float) ->
     The ground gives no echo: it is met at too flat an angle.
 
     Args:
-        cast: ranges to the walls in the level; its angles are those that the rays of a level body would have.
+        cast: ranges to the walls in the horizontal plane, for the ray angles of a level body.
         yaw: yaw of the body in the map frame, rad.
-        pitch: its nose down positive, rad.
-        roll: its right side down positive, rad.
+        pitch: pitch of the body, nose down positive (rad).
+        roll: roll of the body, right side down positive (rad).
         over: height of the walls over the sonars (m); sound above it passes.
     """
     if pitch == 0.0 and roll == 0.0:
@@ -130,9 +129,9 @@ def heard(distance: float, model: SonarModelConfig, noise: np.random.Generator |
     """Return the measured range (m) with noise, dropouts and limits; inf without an echo.
 
     Args:
-        distance: true one, m; inf = no echo.
+        distance: true distance (m); inf without an echo.
         model: settings.
-        noise: random generator, of which two draws are taken; None for no noise.
+        noise: random generator, used for two draws; None for no noise.
     """
     if noise is not None:
         drawn, kept = noise.standard_normal(), noise.random() >= model.dropout
@@ -148,16 +147,16 @@ def _normals(x: Array, y: Array, ranges: Array) -> tuple[Array, NDArray[np.bool_
     count = len(ranges)
     near, far = np.minimum(ranges[1:], ranges[:-1]), np.maximum(ranges[1:], ranges[:-1])
     with np.errstate(invalid="ignore", divide="ignore"):
-        # 0.2: neighbouring rays have an edge between them where their ranges differ by more, m, and their inverse
-        # ranges by more of the greater one: along a straight wall these are near each other even where it is seen at a
-        # grazing angle
+        # 0.2: neighbouring rays have an edge between them if their ranges differ by more, m, and their inverse ranges
+        # by more than this share of the greater: along a straight wall inverse ranges are similar even at a grazing
+        # angle
         gaps = (far - near > 0.12) & (1.0 - near / far > 0.2)  # m
     piece = np.concatenate([[0], np.cumsum(gaps)])
     scatters = np.zeros(count, dtype=np.bool_)
     # The nearer side of a jump within the cone is an edge.
     nearer = np.flatnonzero(gaps) + (ranges[1:] < ranges[:-1])[gaps]
     scatters[nearer] = np.isfinite(ranges[nearer])
-    # 0.08: points this near on both sides tell the direction of a wall, m: some cells of a map
+    # 0.08: distance of the points on both sides that give the direction of a wall, m: some cells of a map
     around = np.hypot(x[:, None] - x, y[:, None] - y) <= 0.08
     # 3: rays on both sides that tell the direction of a wall at any distance
     around |= np.abs(np.arange(count)[:, None] - np.arange(count)) <= 3

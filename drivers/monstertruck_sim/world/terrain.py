@@ -25,7 +25,7 @@ class Profile:
     points: tuple[tuple[float, float], ...]
 
     def height(self, x: Array) -> Array:
-        """Metres; of the shape of ``x``."""
+        """Return the heights (m) in the shape of ``x``."""
         return np.asarray(np.interp(x, [p[0] for p in self.points], [p[1] for p in self.points]))
 
 
@@ -44,7 +44,7 @@ class Terrain:
         self._profile, self._patches = profile, patches
 
     def height(self, x: Array, y: Array) -> Array:
-        """Metres at points in the map frame; all of one shape."""
+        """Return the heights at points in the map frame (m); all arrays have one shape."""
         z = self._profile.height(x)
         for patch in self._patches:
             dx, dy = x - patch.x, y - patch.y
@@ -54,24 +54,24 @@ class Terrain:
         return z
 
     def tilt(self, x: float, y: float, yaw: float, wheelbase: float, track: float) -> tuple[float, float]:
-        """Pitch (nose down positive) and roll (right side down positive) of a body on four wheels, rad."""
+        """Return pitch (nose down positive) and roll (right side down positive) of a body on four wheels (rad)."""
         along, across = np.array((1, 1, -1, -1)) * wheelbase / 2, np.array((1, -1, 1, -1)) * track / 2
         c, s = np.cos(yaw), np.sin(yaw)
         fl, fr, rl, rr = self.height(x + c * along - s * across, y + s * along + c * across).tolist()
         return -atan((fl + fr - rl - rr) / 2 / wheelbase), atan((fl + rl - fr - rr) / 2 / track)
 
     def cast(self, xs: Array, ys: Array, zs: Array, headings: Array, rises: Array, reach: float) -> Array:
-        """Horizontal distances at which beams meet the ground; inf = not within ``reach``.
+        """Return the horizontal distances of the beams' hits on the ground; inf without a hit within ``reach``.
 
         Args:
             xs: origins, (n,), m.
-            ys: the same.
-            zs: the same.
+            ys: y of the origins.
+            zs: z of the origins.
             headings: directions in the plane, (n,), rad.
             rises: metres upwards a metre of horizontal distance, (n,).
             reach: longest horizontal distance, m.
         """
-        step = 0.05  # horizontal distance between two looks along a beam, m
+        step = 0.05  # horizontal distance between two samples along a beam, m
         ways = np.arange(0.0, reach + step, step)
         x = xs[:, None] + np.cos(headings)[:, None] * ways
         y = ys[:, None] + np.sin(headings)[:, None] * ways
@@ -85,7 +85,7 @@ class Terrain:
 
 
 def rocking(config: SinusoidTilt, elapsed_ns: int) -> tuple[float, float]:
-    """Pitch and roll, rad, ``elapsed_ns`` after the world's start."""
+    """Return pitch and roll ``elapsed_ns`` after the world's start (rad)."""
     phase = 2 * pi * config.frequency * elapsed_ns * 1e-9
     return radians(config.pitch_deg) * sin(phase), -radians(config.roll_deg) * cos(phase)
 
@@ -113,5 +113,5 @@ def load_profile(path: Path) -> Profile:
 
 
 def save_profile(profile: Profile, path: Path) -> None:
-    """Write what ``load_profile`` reads."""
+    """Write the file format of ``load_profile``."""
     path.write_text(yaml_text({"points": [list(p) for p in profile.points]}), encoding="utf-8")

@@ -1,8 +1,8 @@
 """The truck in the plane: motors, clutches, steering, tyres, body, battery; integrated lazily on a fixed grid.
 
-Steps are 5 ms: a quarter of the fastest lag (which is integrated exactly anyway), a quarter of a servo frame, and at
-0.22 m/s a body point moves less than 2 mm a step, so testing the footprint after each step misses no cell. A step
-ends early at the requested instant; the grid itself never shifts.
+Steps are 5 ms: a quarter of the fastest lag (which is integrated exactly), a quarter of a servo frame, and short enough
+that at 0.22 m/s a body point moves less than 2 mm, so a test of the footprint after each step misses no cell. A step
+ends early at the requested instant; the time grid itself never shifts.
 """
 
 from collections.abc import Callable
@@ -134,7 +134,7 @@ class TruckPlant(Plant):
         if self._tyres is None:
             vx, _, wz = self._twist
             pressed = vx * wz + PLANT_GRAVITY * sin(self._attitude[1])
-            grip = PLANT_GRAVITY  # greatest lateral acceleration of tyres with a friction coefficient of 1
+            grip = PLANT_GRAVITY  # maximum lateral acceleration of tyres with a friction coefficient of 1
             lateral = min(max(pressed, -grip), grip) * copysign(1.0, wheels[0])
         front_slip = config.front_slip_angle * lateral - config.slip_angle_noise * front_noise
         rear_slip = config.rear_slip_angle * lateral - config.slip_angle_noise * rear_noise
@@ -163,7 +163,7 @@ class TruckPlant(Plant):
             self._twist = (0.0, 0.0, 0.0)
         else:
             self._pose, self._twist = pose, twist
-            # 0.005: distance from the place of contact that frees the robot again, m
+            # 0.005: minimum distance from the place of contact of a free robot, m
             if self._stuck_at and hypot(pose[0] - self._stuck_at[0], pose[1] - self._stuck_at[1]) > 0.005:
                 self._stuck_at = None
         self._attitude = self._tilt(self._elapsed, *self._pose)
@@ -177,7 +177,7 @@ class TruckPlant(Plant):
 
 
 class _Steering:
-    """Steering angles behind the linkage, and how fast the body goes per speed of the wheels; recomputed on change.
+    """Steering angles behind the linkage, and speed of the body per speed of the wheels; recomputed on change.
 
     The truck's one motor drives four wheels through open differentials: it turns with the mean of the speeds that
     the body drags them, each along its own angle.
@@ -209,9 +209,9 @@ def _tyres(config: SimTruckConfig, chassis: Chassis) -> SingleTrack | None:
 class SkidEffects:
     """Skid-steer effects beyond the kinematic model: unequal wheels, a turn at each reversal, a slow slide.
 
-    The skid-steer paper saw all three: its robot bent within a pass although its motors had equal commands, turned a
-    little whenever it reversed, and its circles wandered. Body parameters (turning centres, effective radii) are the
-    body's own. Every draw is a function of seed and number of the reversal.
+    The skid-steer paper observed all three effects: its robot curved within a pass although its motors had equal
+    commands, turned a little at every reversal, and its circles wandered. Parameters such as turning centres and
+    effective radii belong to the body. Every draw is a function of seed and number of the reversal.
 
     Args:
         config: its parameters.
@@ -233,10 +233,10 @@ class SkidEffects:
         return [speed * gain for speed, gain in zip(speeds, gains, strict=True)] if gains else speeds
 
     def twist(self, twist: Twist2, yaw: float, dt: float) -> Twist2:
-        """Velocity of the body that results from the motion of its wheels; m/s, rad/s."""
+        """Return the velocity of the body that results from its wheels (m/s, rad/s)."""
         vx, vy, wz = twist
         turning_time = 0.2  # seconds that the turn at a reversal takes
-        if abs(vx) > 1e-3:  # slower robots stand, m/s
+        if abs(vx) > 1e-3:  # maximum speed of a robot at rest, m/s
             direction = copysign(1.0, vx)
             if direction == -self._direction:
                 self._rate, self._left = self._turn() / turning_time, turning_time

@@ -17,7 +17,7 @@ class RenderedView(SimulatedView):
     """``ViewSource`` of a robot of rigid bodies; questions about the plane are answered by ``SimulatedView``.
 
     Args:
-        drawn: the same camera in the plane.
+        drawn: equivalent camera in the plane.
 
     Raises:
         NotInstalledError: this computer has no EGL.
@@ -33,14 +33,14 @@ class RenderedView(SimulatedView):
             raise InputError("sim.world.camera.rendered: expected engine mujoco")
         self._rigid = drawn.plant
         self._thread = ThreadPoolExecutor(1, "camera")
-        """A context of EGL belongs to one thread."""
+        """An EGL context belongs to one thread."""
         self._renderers: dict[tuple[int, int], tuple[WorldRenderer, float, Painter]] = {}
-        self._renderer((640, 480))  # pixels: with what it is tried whether this computer can draw
+        self._renderer((640, 480))  # size in pixels of the test image that shows whether this computer can render
         # At the program's end the thread is gone before, and the context with it.
         weakref.finalize(self, _close, self._thread, self._renderers).atexit = False
 
     def exposure(self, time_ns: int, size: tuple[int, int]) -> Drawing:
-        """``ViewSource``: takes the world over at once, renders when called."""
+        """``ViewSource`` that copies the world's state at once and renders when called."""
         self._rigid.advance(time_ns)
         renderer, wider, painter = self._renderer(size)
         place = self._place(time_ns)

@@ -1,8 +1,8 @@
 """The engine ``mujoco``: one robot of rigid bodies in the surroundings that all engines share.
 
-Walls, ground and whatever moves are in MuJoCo's model for contact. Sensor rays are cast on the same map and
-heights by the project's own kernels: MuJoCo's rays cost 0.9 ms a scan against 400 boxes and 0.3 s against a field of
-400 x 400 heights. Only blocks on the ground, which those kernels do not model, are found by MuJoCo's rays.
+Walls, ground and all moving bodies are in MuJoCo's model for contact. Sensor rays are cast on the same map and heights
+by the project's own kernels: MuJoCo's rays cost 0.9 ms per scan against 400 boxes and 0.3 s against a field of 400 x
+400 heights. MuJoCo's rays find only blocks on the ground, which those kernels do not model.
 """
 
 from functools import partial
@@ -127,7 +127,7 @@ class RigidSpace(Space):
         return [body for body in self._scene.bodies if body.name != self._name]
 
     def _show(self, name: str, shown: _Shown) -> None:
-        """Put a spare body to where something is; one that is not used costs neither steps nor pictures anything."""
+        """Move a spare body to an object's place; an unused one costs neither steps nor rendering."""
         model, data = self._plant.model, self._plant.data
         body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
         mocap, geom = model.body_mocapid[body], model.body_geomadr[body]
@@ -217,16 +217,16 @@ class RigidEchoes:
 
 
 def has_blocks(plant: RigidPlant) -> bool:
-    """Whether anything stands on the ground that the kernels of walls and heights do not know."""
+    """Whether objects stand on the ground that the kernels of walls and heights do not model."""
     return bool((plant.model.geom_group == Group.BLOCKS).any())
 
 
 def to_blocks(plant: RigidPlant, places: Array, ways: Array, reach: float) -> Array:
-    """Ranges of beams to the blocks on the ground by MuJoCo's rays, m, (n,); inf = nothing within ``reach``.
+    """Return the beams' ranges to blocks on the ground by MuJoCo's rays, (n,) (m); inf without a hit within ``reach``.
 
     Args:
         plant: the robot, in its model.
-        places: where the beams begin, (n, 3), m; neighbours in the array are neighbours in space.
+        places: origins of the beams, (n, 3) (m); neighbours in the array are neighbours in space.
         ways: directions as unit vectors, (n, 3).
         reach: m.
     """
@@ -251,11 +251,11 @@ def to_blocks(plant: RigidPlant, places: Array, ways: Array, reach: float) -> Ar
 def drive_line(truck: SimTruckConfig, parts: Mechanics) -> DriveLine:
     """Drive line of a body.
 
-    Of the truck one motor for four wheels: open differentials in both axles, a rigid transfer case between them. Of a
-    car the rear wheels, with a differential. Of a skid-steer robot the wheels of a side, coupled, or every wheel alone.
-    Of a platform every wheel alone.
+    A truck has one motor for four wheels: open differentials in both axles and a rigid transfer case between them. A
+    car drives its rear wheels through a differential, a skid-steer robot the coupled wheels of each side or every wheel
+    separately, and a platform every wheel separately.
 
-    The wind-up is as stiff as lets the wheels follow critically damped with the mean delay ``motor.drivetrain_lag``.
+    The wind-up is stiff enough for the wheels to follow critically damped with the mean delay ``motor.drivetrain_lag``.
     """
     front, rear = (tuple(f"{axle}_{side}_spin" for side in ("left", "right")) for axle in ("front", "rear"))
     shafts: tuple[tuple[str, ...], ...] = ((*front, *rear),)

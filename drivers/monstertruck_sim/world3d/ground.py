@@ -29,7 +29,7 @@ from monstertruck_sim.world3d.heights import HeightGrid
 from monstertruck_sim.world3d.model import Block
 
 HEIGHT_STEP: Final = 0.05
-"""Distance of the points of the height field, m."""
+"""Spacing of the height field's points (m)."""
 
 Bounds = tuple[float, float, float, float]
 """Minimum and maximum x, then y, m."""
@@ -124,7 +124,7 @@ def _standing(
 ) -> Block:
     foot = 0.0 if heights is None else float(heights.height(np.array(x), np.array(y)))
     length, width, height = size
-    embedded = 0.05  # how deep blocks stand in the ground, m
+    embedded = 0.05  # depth of blocks in the ground, m
     middle = foot + (height - embedded) / 2
     return Block(x, y, middle, length, width, height + embedded, yaw, pitch)
 
@@ -132,8 +132,8 @@ def _standing(
 def scenery(path: Path) -> tuple[list[ET.Element], list[ET.Element]]:
     """Assets, and bodies and geometries, of an MJCF file; angles in radians, files of assets by their whole names.
 
-    Its angles are degrees unless its ``compiler`` says otherwise, and its assets' files lie where that says (MuJoCo XML
-    reference, element compiler).
+    Its angles are in degrees, and its asset files relative to it, unless its ``compiler`` element specifies otherwise
+    (MuJoCo XML reference, element compiler).
 
     Raises:
         InputError: it is not an MJCF file, contains a moving body or unsupported elements: classes of defaults,

@@ -1,7 +1,7 @@
-"""Height of the ground on a grid, and where beams meet it: the same triangles as MuJoCo's height field, by numba.
+"""Height of the ground on a grid, and hits of beams on it: the triangles of MuJoCo's height field, by numba.
 
-MuJoCo's own rays look at every cell of the field below a beam's bounding box: 0.4 ms a beam on 400 x 400 points, a
-third of a second a scan. These walk along the beam from cell to cell.
+MuJoCo's own rays test every cell of the field below a beam's bounding box: 0.4 ms per beam on 400 x 400 points, a third
+of a second per scan. This module's rays walk along the beam from cell to cell.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ class HeightGrid:
     """Heights at the points of a square grid; beyond its edge the edge's height.
 
     Args:
-        z: (rows, columns), row 0 at the least y, m.
+        z: heights, (rows, columns), row 0 at the lowest y (m).
         resolution: distance of two points, m.
         origin: x, y of the first point, m.
     """
@@ -28,7 +28,7 @@ class HeightGrid:
     origin: tuple[float, float]
 
     def height(self, x: Array, y: Array) -> Array:
-        """Metres, of points of one shape."""
+        """Return the heights (m) of points in arrays of one shape."""
         shape = np.shape(x)
         flat = np.ravel(x).astype(np.float64), np.ravel(y).astype(np.float64)
         return np.asarray(_heights(self.z, self.resolution, *self.origin, *flat)).reshape(shape)
@@ -44,12 +44,12 @@ class HeightGrid:
         return float(part.min()), float(part.max())
 
     def cast(self, xs: Array, ys: Array, zs: Array, headings: Array, rises: Array, reach: float) -> Array:
-        """Horizontal distances at which beams meet the ground; inf = not within ``reach``.
+        """Return the horizontal distances of the beams' hits on the ground; inf without a hit within ``reach``.
 
         Args:
             xs: origins, (n,), m.
-            ys: the same.
-            zs: the same.
+            ys: y of the origins.
+            zs: z of the origins.
             headings: directions in the plane, (n,), rad.
             rises: metres upwards a metre of horizontal distance, (n,).
             reach: longest horizontal distance, m.

@@ -1,6 +1,6 @@
 """The MuJoCo model: MJCF of a robot's description, of its drive line, and of the ground and walls around it.
 
-Geometries are in groups: ground, walls, blocks on the ground, the robot, and what can move or be put there.
+Geometries are grouped: ground, walls, blocks on the ground, the robot, and bodies that move or can be added.
 """
 
 import logging
@@ -32,13 +32,13 @@ PARKED: Final = -50.0
 SUPPORTS: Final = tuple(f"support_{i}" for i in range(4))
 """Blocks that can be put under wheels."""
 TALL: Final = 0.6
-"""Height of objects that are put into a world, m."""
+"""Height of objects added to a world (m)."""
 
 log = logging.getLogger(__name__)
 
 
 class Warnings:
-    """Warnings of MuJoCo, which by default writes them to a file in the current folder."""
+    """Warnings of MuJoCo, which it would otherwise write to a file in the current folder."""
 
     count: ClassVar[int] = 0
 
@@ -68,7 +68,7 @@ UPRIGHT: Final = TouchBits(9, 2)
 """Walls and objects."""
 _TOUCHES: Final = {"all": TouchBits(2, 1), "ground": TouchBits(0, 4), "walls": TouchBits(0, 8)}
 _TYRE: Final = "0.01 1"
-"""Time constant, s, and damping ratio of its contact: under the weight it gives 0.3 mm."""
+"""Time constant (s) and damping ratio of the robot's contact, which gives 0.3 mm under its weight."""
 
 
 class Group(IntEnum):
@@ -80,7 +80,7 @@ class Group(IntEnum):
     ROBOT = 3
     MOVING = 4
     SIGNS = 5
-    """Tags: nothing touches them."""
+    """Tags, which have no contact."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,12 +88,12 @@ class DriveLine:
     """Mechanics between the shafts and the wheels.
 
     Args:
-        shafts: for every driven shaft its wheels' spin joints; between them are open differentials: the shaft turns
-            with the mean of its wheels and gives all the same torque.
+        shafts: spin joints of the wheels of every driven shaft. Open differentials connect them: the shaft turns with
+            the mean speed of its wheels, and all get the same torque.
         locked: groups of spin joints whose means turn equally (a rigid transfer case).
         stiffness: stiffness of the wind-up between a shaft and the mean of its wheels, Nm/rad.
         damping: Nm s/rad.
-        clutch: greatest torque of all wheels of a shaft together, Nm.
+        clutch: maximum total torque of a shaft's wheels (Nm).
         turns: turns of a spin joint a turn of its wheel, where it is not 1.
     """
 
@@ -124,7 +124,7 @@ class StaticScene:
     """Everything around the robot that does not move.
 
     Args:
-        walls: rectangles of solid map cells, (n, 4): least x, least y, greatest x, greatest y, m.
+        walls: rectangles of solid map cells, (n, 4): minimum x, minimum y, maximum x, maximum y (m).
         wall_height: over the ground, m.
         heights: heights of the ground; None: level at 0.
         blocks: on it.
@@ -147,7 +147,7 @@ EMPTY: Final = StaticScene(np.zeros((0, 4)), TALL, None)
 
 
 def rectangles(solid: NDArray[np.bool_], resolution: float, origin: tuple[float, float], longest: int = 80) -> Array:
-    """Few rectangles that cover exactly the solid cells, (n, 4): x0, y0, x1, y1, m.
+    """Return a few rectangles that exactly cover the solid cells, (n, 4): x0, y0, x1, y1 (m).
 
     Args:
         solid: (rows, columns), row 0 lowest y.

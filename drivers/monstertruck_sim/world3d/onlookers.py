@@ -23,19 +23,19 @@ from monstertruck_sim.world3d.plant import RigidPlant
 FRAME_RATE: Final = 8
 """Frames a second."""
 _BEHIND, _ASIDE, _ABOVE = 1.25, 0.7, 0.95
-"""Place of the camera from the robot, m; it swings round behind a robot that turns."""
+"""Position of the camera relative to the robot (m); it swings around behind a turning robot."""
 _PLAIN: Final = Image.Dither.NONE
 
 
 class Film:
     """Frames of one robot; to be used on the loop of a virtual clock, for a frame takes tens of milliseconds.
 
-    A context manager. A run that ends by an error of the robot's is shown; one that is broken off leaves no file.
+    Use it as a context manager. A run that ends with an error of the robot is kept; an interrupted one leaves no file.
 
     Args:
         world: with the robot.
         clock: its time.
-        file: GIF, written as it is filmed; it takes its name at the end.
+        file: GIF file, written during the run and renamed at its end.
 
     Raises:
         InputError: the engine has nothing to draw, or the file is not a GIF.
@@ -70,7 +70,7 @@ class Film:
         self._world.truth(now)
         x, y, yaw = self._plant.pose
         z = self._plant.height
-        self._heading += 0.12 * (yaw - self._heading)  # share of the way round that it makes from frame to frame
+        self._heading += 0.12 * (yaw - self._heading)  # share of the remaining angle covered from frame to frame
         c, s = cos(self._heading), sin(self._heading)
         camera = x - _BEHIND * c + _ASIDE * s, y - _BEHIND * s - _ASIDE * c, z + _ABOVE
         view = looking_at(camera, (x + 0.3 * c, y + 0.3 * s, z + 0.1))
@@ -103,7 +103,7 @@ class CeilingView(RenderedView):
 
     Raises:
         NotInstalledError: this computer has no EGL.
-        InputError: the world has nothing to render.
+        InputError: the world has no renderer.
     """
 
     HIDDEN: tuple[Group, ...] = ()

@@ -14,7 +14,7 @@ from monstertruck_sim.world3d.model import Group
 from monstertruck_sim.world3d.plant import RigidPlant
 
 Somebody = tuple[float, float, float, float]
-"""Place, height of the ground, and radius, m."""
+"""Position, height of the ground and radius (m)."""
 Picture = NDArray[np.uint8]
 """(height, width, 3), red, green and blue, the top row first."""
 
@@ -27,7 +27,7 @@ class CameraPose:
         place: place of the camera, m.
         ahead: unit vector, the axis of the picture.
         up: unit vector, at a right angle to it.
-        field_of_view: from the lower to the upper edge, rad.
+        field_of_view: vertical angle of view (rad).
     """
 
     place: tuple[float, float, float]
@@ -39,7 +39,7 @@ class CameraPose:
 def looking_at(
     place: tuple[float, float, float], at: tuple[float, float, float], field_of_view: float = 1.0
 ) -> CameraPose:
-    """An upright camera that looks at a point."""
+    """An upright camera aimed at a point."""
     ahead = np.subtract(at, place) / np.linalg.norm(np.subtract(at, place))
     left = np.cross((0.0, 0.0, 1.0), ahead)
     left /= np.linalg.norm(left)

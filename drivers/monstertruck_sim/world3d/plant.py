@@ -107,7 +107,7 @@ class RigidPlant(Plant):
         self._head_shafts = np.zeros(len(self._head))
         """Angles of the stabiliser's shafts at the latest step (rad)."""
         self._rolling = [model.jnt_qposadr[i] for i in range(model.njnt) if model.joint(i).name.endswith("_rollers")]
-        """Balls that stand for wheels with rollers; their axis across the rollers stays level."""
+        """Balls in place of wheels with rollers; their axis across the rollers stays level."""
         self._tyres = _tyres(model, parts, config.wheel_radius)
         self._deflection = [0.0] * (0 if self._tyres is None else len(self._tyres.joints))
         """Longitudinal and lateral deflection of the tyres (m)."""
@@ -144,7 +144,7 @@ class RigidPlant(Plant):
         super().integrate(time_ns)
 
     def carry(self, pose: Pose2) -> None:
-        """Put the robot down elsewhere, at rest; sensors see no way between the two places.
+        """Put the robot down elsewhere at rest; sensors see no motion between the two places.
 
         Raises:
             InputError: it cannot stand there, and is where it was.
@@ -161,10 +161,10 @@ class RigidPlant(Plant):
     def stand(self, pitch: float, roll: float) -> None:
         """Lift it onto blocks that tilt it so, rad, or off them (0, 0); it keeps its place, and comes to rest there.
 
-        Without a tilt nothing changes for a robot that is on no blocks.
+        Without a tilt, a robot that stands on no blocks is unchanged.
 
         Raises:
-            InputError: it does not stand so, and is as it was.
+            InputError: the robot cannot stand at this tilt, and is unchanged.
         """
         if not any((pitch, roll, *self._on_blocks)):
             return
@@ -181,7 +181,7 @@ class RigidPlant(Plant):
             raise
 
     def _support(self, pose: Pose2) -> float:
-        """Turn the robot as it is to stand, and put blocks below its wheels; height of its base then, m."""
+        """Turn the robot to its tilt, and put blocks below its wheels; return the height of its base then (m)."""
         model, data = self.model, self.data
         x, y, yaw = pose
         (cy, sy), (cp, sp), (cr, sr) = ((cos(angle / 2), sin(angle / 2)) for angle in (yaw, *self._on_blocks))
@@ -201,7 +201,7 @@ class RigidPlant(Plant):
             body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
             geom, mocap = model.body_geomadr[body], model.body_mocapid[body]
             ahead, aside, rise = (x, y, base) + feet[i] if i < len(feet) else np.zeros(3)
-            used = rise > 0.002  # height below which a wheel gets no block, m
+            used = rise > 0.002  # minimum height of a wheel with a block, m
             kind, affinity = CARRIES if used else UNTOUCHED
             model.geom_contype[geom] = model.body_contype[body] = kind
             model.geom_conaffinity[geom] = model.body_conaffinity[body] = affinity
@@ -226,14 +226,14 @@ class RigidPlant(Plant):
         self._deflection = [0.0] * len(self._deflection)
         self._command(0.0, [servo.angle for servo in self._servos])
         self._warned = Warnings.count
-        for _ in range(400):  # steps that a robot which was put down gets to come to rest
+        for _ in range(400):  # number of steps for a robot that was put down to come to rest
             mujoco.mj_step(self.model, data)
             if Warnings.count != self._warned:
                 break
             data.qpos[:2] = x, y
             data.qvel[:2] *= 0.5
         inside = data.ncon > 0 and data.contact.dist.min() < -0.03  # maximum plausible depth of a contact, m
-        # 0.5: vertical speed that a robot at rest cannot have, m/s
+        # 0.5: maximum vertical speed of a robot at rest, m/s
         if self._unstable() or inside or not abs(data.qvel[2]) < 0.5:
             raise InputError(
                 f"the robot does not come to rest at ({x:.2f}, {y:.2f}): another object occupies this place"
@@ -268,7 +268,7 @@ class RigidPlant(Plant):
         return any(self.data.warning[which].number for which in _UNSTABLE)
 
     def _require_stable(self) -> None:
-        """After a warning, which may be of another robot's model.
+        """Continue after a warning, which may come from another robot's model.
 
         Raises:
             CommandFailedError: numbers of this one grew beyond all bounds.
@@ -279,7 +279,7 @@ class RigidPlant(Plant):
             raise CommandFailedError(f"the simulation of the robot at ({x:.2f}, {y:.2f}) became unstable")
 
     def _roll(self, places: list[float], speeds: list[float]) -> None:
-        """Tyres give way where they touch the ground; rolling on brings a fresh piece of them there.
+        """Tyres deform where they touch the ground; rolling replaces the contact by a fresh part of the tyre.
 
         Their deflection d follows d' = u' - |v| d / relaxation, u' being the slip of the rolling wheel: the force
         settles at ``tyre_stiffness`` times the slip ratio, or the tangent of the slip angle, and dry friction bounds
@@ -313,7 +313,7 @@ class RigidPlant(Plant):
             controls[self._first_shaft + i] = self._wound[i] + drive.damping / drive.stiffness * speed
 
     def _slip(self) -> list[float]:
-        """Pull of every shaft at the ground, N; a clutch that slips lets its shaft wind the wheels up no further."""
+        """Return the force of every shaft at the ground (N); a slipping clutch stops further wind-up of the wheels."""
         drive, data, pulls = self._drive, self.data, []
         for i, shaft in enumerate(self.shafts):
             index = self._first_shaft + i
@@ -363,12 +363,12 @@ class RigidPlant(Plant):
         """Walls, objects and people stop the robot; ground and blocks carry it."""
         solid = self._solid
         if self.data.ncon and any(solid[a] or solid[b] for a, b in self.data.contact.geom.tolist()):
-            # 0.01: slower than this, m/s, a touch is not a collision
+            # 0.01: minimum speed of a collision, m/s
             if self._stuck_at is None and hypot(*self._twist[:2]) > 0.01:
                 self.on_blocked(self._pose, self._twist)
             self._stuck_at = self._pose
         elif self._stuck_at is not None:
             x, y, _ = self._stuck_at
-            # 0.005: the robot is free again at this distance from the place of contact, m
+            # 0.005: minimum distance from the place of contact of a free robot, m
             if hypot(self._pose[0] - x, self._pose[1] - y) > 0.005:
                 self._stuck_at = None
