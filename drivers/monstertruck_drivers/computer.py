@@ -173,9 +173,9 @@ class Disk:
     """A file system."""
 
     total: int
-    """Total size, bytes."""
+    """Total size (bytes)."""
     free: int
-    """Free space for ordinary users, bytes."""
+    """Free space for ordinary users (bytes)."""
 
 
 def disk_of(path: Path) -> Disk:

@@ -67,12 +67,12 @@ class DisobedientMotor:
         """Return the speed to which the motor is driven.
 
         Args:
-            asked: commanded speed, rpm; None: power stage off.
-            present: motor speed, rpm.
+            asked: commanded speed (rpm); None: power stage off.
+            present: motor speed (rpm).
             line: whether the hardware input requests a quick stop.
 
         Returns:
-            Speed, rpm; None: power stage off.
+            Speed (rpm); None: power stage off.
         """
         if asked is None and self.stopped_by is StoppedBy.STAGE:
             return None

@@ -151,10 +151,10 @@ class BeamSource(Protocol):
     """Source of beam ranges for a scanner of any geometry."""
 
     def beams(self, bearings: Array, times_ns: NDArray[np.int64], sheet: RangeSheet) -> Array:
-        """Ranges of single beams, shape (n,), m: +inf: nothing within range, NaN: the measurement failed.
+        """Ranges of single beams, shape (n,) (m): +inf: nothing within range, NaN: the measurement failed.
 
         Args:
-            bearings: counter-clockwise from the scanner's x axis, shape (n,), rad.
+            bearings: counter-clockwise from the scanner's x axis, shape (n,) (rad).
             times_ns: times of the beams, shape (n,), increasing, over at most half a second.
             sheet: reach and noise.
         """
@@ -237,9 +237,9 @@ class ImuReading(NamedTuple):
     """True input of an inertial measurement unit, in its axes: x forward, y left, z up."""
 
     angular_velocity: tuple[float, float, float]
-    """Angular velocity, rad/s."""
+    """Angular velocity (rad/s)."""
     acceleration: tuple[float, float, float]
-    """Specific force, m/s^2: at rest and level, z is +9.81."""
+    """Specific force (m/s^2): at rest and level, z is +9.81."""
     temperature_c: float
 
 
@@ -286,7 +286,7 @@ class ViewSource(Protocol):
 
         Args:
             time_ns: time of the exposure.
-            size: width and height, pixels.
+            size: width and height (pixels).
 
         Returns:
             Function that returns an image (height, width, 3): red, green, blue; the top row first.

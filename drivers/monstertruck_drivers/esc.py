@@ -41,7 +41,7 @@ class UnmeasuredMotor:
         self._out = out
         self._timeout = round(command_timeout * SECOND)
         self._ready_at = 0
-        """Time when the speed controller has received its neutral pulses, ns."""
+        """Time when the speed controller has received its neutral pulses (ns)."""
         self._rate = self._turned = 0.0
         """Estimated rate, rad/s, and angle, rad, at ``_at``."""
         self._at = 0
@@ -55,7 +55,7 @@ class UnmeasuredMotor:
         return self._esc.pulse_us(self._wanted(self._clock.now()))
 
     def _wanted(self, now: int) -> float:
-        """Rate to command, rad/s."""
+        """Rate to command (rad/s)."""
         command = self._commands.latest
         if command is None or self._mode(now) is not DriveMode.ENABLED or now < self._ready_at:
             return 0.0

@@ -15,17 +15,17 @@ class ImuCorrection(Schema):
     """Calibrated correction of the measurements, in the unit's axes."""
 
     rate_x: float = 0.0
-    """Bias of the angular velocity, rad/s"""
+    """Bias of the angular velocity (rad/s)"""
     rate_y: float = 0.0
-    """Bias about y, rad/s"""
+    """Bias about y (rad/s)"""
     rate_z: float = 0.0
-    """Bias about z, rad/s"""
+    """Bias about z (rad/s)"""
     rate_scale: Annotated[float, Field(ge=0.5, le=2)] = 1.0
     """Factor on the angular velocity about z, its bias taken out"""
     force_x: float = 0.0
-    """Bias of the specific force, m/s^2"""
+    """Bias of the specific force (m/s^2)"""
     force_y: float = 0.0
-    """Bias along y, m/s^2"""
+    """Bias along y (m/s^2)"""
 
 
 def mean(vectors: Sequence[Xyz]) -> Xyz:
@@ -35,12 +35,12 @@ def mean(vectors: Sequence[Xyz]) -> Xyz:
 
 
 def corrected_rate(rate: Xyz, by: ImuCorrection) -> Vector3:
-    """Angular velocity without its biases, rad/s."""
+    """Angular velocity without its biases (rad/s)."""
     x, y, z = rate
     return Vector3(x=x - by.rate_x, y=y - by.rate_y, z=(z - by.rate_z) * by.rate_scale)
 
 
 def corrected_force(force: Xyz, by: ImuCorrection) -> Vector3:
-    """Specific force without its biases, m/s^2."""
+    """Specific force without its biases (m/s^2)."""
     x, y, z = force
     return Vector3(x=x - by.force_x, y=y - by.force_y, z=z)

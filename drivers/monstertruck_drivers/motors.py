@@ -50,7 +50,7 @@ def requested(
 
     Args:
         commands: latest command of each shaft, if any.
-        now: time, ns.
+        now: time (ns).
         timeout: maximum age of a command (s); an older one stops the motors.
 
     Returns:

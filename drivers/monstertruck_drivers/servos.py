@@ -64,11 +64,11 @@ class EscPulses(Schema):
     direction: Literal[-1, 1] = 1
     """+1 where a longer pulse drives forward"""
     max_rate: Annotated[float, Field(gt=0, le=10_000)] = 300.0
-    """Rate at the end of the pulses, as measured, rad/s; requests are limited to this"""
+    """Rate at the end of the pulses, as measured (rad/s); requests are limited to this"""
     deceleration: Annotated[float, Field(gt=0)] = 400.0
-    """Deceleration by a lower pulse, as measured, rad/s^2"""
+    """Deceleration by a lower pulse, as measured (rad/s^2)"""
     quick_deceleration: Annotated[float, Field(gt=0)] = 500.0
-    """Deceleration at the neutral pulse, as measured, rad/s^2"""
+    """Deceleration at the neutral pulse, as measured (rad/s^2)"""
     arming: Annotated[float, Field(ge=0, le=10)] = 2.0
     """Seconds of neutral pulses that it wants before it moves"""
 

@@ -9,9 +9,9 @@ class MotorLimits(NamedTuple):
     rate: float
     """Maximum rate (rad/s)."""
     deceleration: float
-    """Deceleration of its ordinary ramp, rad/s^2."""
+    """Deceleration of its ordinary ramp (rad/s^2)."""
     quick_deceleration: float
-    """Deceleration of its quick stop, rad/s^2."""
+    """Deceleration of its quick stop (rad/s^2)."""
 
 
 def motor_limits(settings: Any) -> MotorLimits | None:

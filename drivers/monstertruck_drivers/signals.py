@@ -247,7 +247,7 @@ class Signals:
     """The signals of one device.
 
     Args:
-        now: returns the time, ns.
+        now: returns the time (ns).
         kinds: kinds of the signals by name; their order defines the neighbours.
         rng: the device's randomness; the faults' randomness is spawned from it.
         codes: minimum of the measured values, by array; lower values are codes, which arithmetic faults do not

@@ -24,11 +24,11 @@ class CeilingCamera(CameraConfig):
     port: Path
     """Link created for the camera; the stand's camera of kind `rendered` uses the same one"""
     x: float = 0.0
-    """Position in the map, m"""
+    """Position in the map (m)"""
     y: float = 0.0
     """m"""
     height: Annotated[float, Field(gt=0)] = 2.2
-    """Over the ground, m"""
+    """Over the ground (m)"""
     pitch: float = 1.5707963268
     """Downwards positive (rad): at 90 degrees the camera looks down, with the upper edge of the image towards `yaw`"""
     rendered: Literal[True] = True

@@ -42,7 +42,7 @@ VITAL: Final = ("drive", "steering", "lidar", "lidar_2", "compass", *MORE_DRIVES
 SHORT_WRITES: Final = 19
 """Maximum number of consecutive writes cut in half."""
 ALL_ROUND: Final = "-135 135"
-"""Directions of all the lidar's beams, degrees."""
+"""Directions of all the lidar's beams (degrees)."""
 UNKNOWN_CODES: Final = (*range(3, 20),)
 """Codes of the lidar for beams without information; 0 to 2 mean no return within range."""
 

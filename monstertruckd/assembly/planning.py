@@ -355,7 +355,7 @@ def _build_missions(config: TruckConfig, bus: Bus, clock: Clock, parts: MissionP
 
 
 def _within_reach(planner: PlannerConfig, angle: float) -> PlannerConfig:
-    """Axle angles at most as large as the servos reach, rad."""
+    """Axle angles at most as large as the servos reach (rad)."""
     escape = planner.escape.model_copy(update={"angle": min(planner.escape.angle, angle)})
     return planner.model_copy(update={"angle": min(planner.angle, angle), "escape": escape})
 

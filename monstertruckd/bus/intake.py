@@ -75,7 +75,7 @@ class _Budget:
 
     left: float
     at: int
-    """When it was true, ns."""
+    """When it was true (ns)."""
 
     def spend(self, now: int, rate: float) -> bool:
         """Take one; False if there is none."""

@@ -25,7 +25,7 @@ from monstertruckd.bus.outgoing import Outgoing, Sent
 M = TypeVar("M", bound=Message)
 
 TapCallback = Callable[[Topic[Any], Message, bytes, int], None]
-"""Gets every message of its topics with the bytes that stand for it outside, and when it was published, ns.
+"""Gets every message of its topics with the bytes that stand for it outside, and when it was published (ns).
 
 Must not block, nor raise."""
 

@@ -17,7 +17,7 @@ BATCH: Final = 10
 """Messages delivered in one iteration of the event loop: a fraction of a millisecond."""
 
 Sent = tuple[Topic[Any], Message, int]
-"""Topic, message and the time it was sent, ns."""
+"""Topic, message and the time it was sent (ns)."""
 
 
 class Outgoing:

@@ -134,9 +134,9 @@ class PeerConfig(Schema):
     endpoint: str
     """Its endpoint, e.g. tcp/192.168.1.8:7447"""
     length: Annotated[float, Field(gt=0, le=10)] | None = None
-    """Length of its outline, m; null: the length of this robot"""
+    """Length of its outline (m); null: the length of this robot"""
     width: Annotated[float, Field(gt=0, le=10)] | None = None
-    """Width of its outline, m; null: the width of this robot"""
+    """Width of its outline (m); null: the width of this robot"""
 
 
 @dataclass(frozen=True, slots=True)

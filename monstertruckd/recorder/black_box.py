@@ -260,9 +260,9 @@ class BlackBox:
 
         Args:
             topic: its entry of the topic table.
-            stamp: the message's own stamp, ns.
+            stamp: the message's own stamp (ns).
             payload: its bytes on the wire.
-            at: when it was published, ns; None: now.
+            at: when it was published (ns); None: now.
         """
         sequence = self._sequences[topic.name]
         self._sequences[topic.name] = sequence + 1

@@ -2,8 +2,8 @@
 
 A step's inputs are a dict:
 
-- ``scans``: list of (pose, points): sensor pose (x, y, yaw) in the map frame, m and rad; points shape (n, 2) in the
-  sensor's frame, m;
+- ``scans``: list of (pose, points): sensor pose (x, y, yaw) in the map frame (m, rad); points shape (n, 2) in the
+  sensor's frame (m);
 - ``render``: absent, or what to draw: ``title``, ``subtitle`` and ``paths``, a list of dicts with ``name``, ``poses``
   (shape (n, 2) or (n, 3), map frame) and ``style``, a key of ``STYLES``;
 - ``file``: where to save the picture; the file appears complete or not at all.

@@ -314,7 +314,7 @@ class _WholeRecord(NamedTuple):
 
 
 class _Times(NamedTuple):
-    """Log times of messages, ns."""
+    """Log times of messages (ns)."""
 
     messages: int
     begin: int

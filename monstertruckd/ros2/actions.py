@@ -64,7 +64,7 @@ class ActionGoal(Generic[W]):
     number: bytes
     """Its UUID."""
     stamp: int
-    """When it was accepted, real time, ns."""
+    """When it was accepted, real time (ns)."""
     work: W
     """Goal in the terms of the robot."""
     status: GoalStatus = GoalStatus.ACCEPTED
@@ -118,7 +118,7 @@ def chosen(goals: Mapping[bytes, ActionGoal[W]], number: bytes, stamp: int) -> t
     Args:
         goals: goals by UUID.
         number: zero = any.
-        stamp: real time, ns; zero = any.
+        stamp: real time (ns); zero = any.
     """
     everything = not any(number)
     if not everything and stamp == 0:

@@ -52,7 +52,7 @@ class RosNames:
     """How stamps and frames are written."""
 
     offset: int = 0
-    """Real time minus robot time, ns."""
+    """Real time minus robot time (ns)."""
     frame: Callable[[str], str] = _own_name
     """Name of a frame of the robot."""
 
@@ -453,7 +453,7 @@ def task_markers(
 
 
 def outline(length: float, width: float) -> list[RosValues]:
-    """Corners of the robot's rectangle around base, m."""
+    """Corners of the robot's rectangle around base (m)."""
     x, y = length / 2.0, width / 2.0
     return [vector(*corner) for corner in ((x, y), (-x, y), (-x, -y), (x, -y))]
 

@@ -45,7 +45,7 @@ class WheelJoints:
 
     chassis: Chassis
     track: float
-    """Distance between left and right wheels, m."""
+    """Distance between left and right wheels (m)."""
     ratio: float
     """Turns of the motor for one of the wheels."""
 

@@ -24,9 +24,9 @@ from monstertruckd.ros2.operators import Operators, frame_in, stamp_of
 from monstertruckd.ros2.rmw import LATCHED
 
 CORRECTION_PERIOD: Final = SECOND // 10
-"""Minimum time between two corrections sent to the robot, ns."""
+"""Minimum time between two corrections sent to the robot (ns)."""
 CORRECTION_LEASE: Final = SECOND
-"""Maximum age of a correction, ns."""
+"""Maximum age of a correction (ns)."""
 
 
 def pose_in(pose: RosMessage) -> Array:
@@ -56,7 +56,7 @@ class RosLocalisation:
         self._odom: tuple[int, Array] | None = None
         """When ``/tf`` brought the pose of odom in map last, ns, and the pose."""
         self._estimated_at: int | None = None
-        """When ``odometry/filtered`` brought a pose in odom last, ns."""
+        """When ``odometry/filtered`` brought a pose in odom last (ns)."""
         self._sent_at: int | None = None
         node.subscribe("/tf", "tf2_msgs/msg/TFMessage", self._tf)
         node.subscribe("odometry/filtered", "nav_msgs/msg/Odometry", self._estimate)

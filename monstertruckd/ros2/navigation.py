@@ -177,7 +177,7 @@ def path_in(message: RosMessage, pose_in: PoseReader, stamp: int) -> Path:
     Args:
         message: the message.
         pose_in: reads a pose.
-        stamp: stamp of the path, ns.
+        stamp: stamp of the path (ns).
 
     Raises:
         InputError: it is too short or too long, or in another frame than map or odom.

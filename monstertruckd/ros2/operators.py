@@ -19,7 +19,7 @@ from monstertruckd.ros2.cdr import RosMessage
 from monstertruckd.ros2.node import RosArrival, RosSender
 
 LEASE: Final = 0.25
-"""Validity of a drive message, s; the face never repeats it."""
+"""Validity of a drive message (s); the face never repeats it."""
 
 RosOrder = Callable[[TruckClient], Awaitable[Any]]
 """Asks the robot for something."""
@@ -58,7 +58,7 @@ def check_arrival(arrival: RosArrival, now: int, newest: dict[bytes, int]) -> No
 
     Args:
         arrival: arrival of a known publisher.
-        now: real time, ns.
+        now: real time (ns).
         newest: latest sequence numbers by publisher; updated with the message.
 
     Raises:
@@ -77,7 +77,7 @@ def check_age(what: str, header: RosMessage, now: int) -> None:
     Args:
         what: name of the message in the refusal.
         header: ``std_msgs/msg/Header``.
-        now: real time, ns.
+        now: real time (ns).
 
     Raises:
         InputError: it is old, or in the future.
@@ -105,7 +105,7 @@ def check_header(header: RosMessage, now: int, frames: tuple[str, ...]) -> None:
 
 
 def planar_twist(twist: RosMessage) -> tuple[float, float, float]:
-    """Velocities forward and to the left, m/s, and turn rate, rad/s.
+    """Velocities forward and to the left, m/s, and turn rate (rad/s).
 
     Numbers that are not finite reach the gate, which refuses them by name.
 
@@ -177,7 +177,7 @@ class Operators:
         Args:
             what: name of the topic.
             arrival: the message.
-            check: raises ``InputError`` for its content; gets the real time, ns.
+            check: raises ``InputError`` for its content; gets the real time (ns).
         """
         sender = arrival.sender
         if sender is None:

@@ -22,7 +22,7 @@ async def fetch_recording(
         name: name of the recording.
         to: file, made with the first bytes.
         progress: gets the share that is there, 0..1.
-        most: maximum size, bytes; None for no limit.
+        most: maximum size (bytes); None for no limit.
 
     Raises:
         InputError: it is larger than that, or the file holds more than it, or something else.

@@ -23,11 +23,11 @@ class ArduinoBridgeConfig(Schema):
     inverted: Annotated[tuple[bool, bool], Field(strict=False)] = (False, False)
     """Left and right: whether driving forward needs negative counts"""
     max_rate: Annotated[float, Field(gt=0, le=1000)] = 10.0
-    """Maximum motor rate, rad/s"""
+    """Maximum motor rate (rad/s)"""
     deceleration: Annotated[float, Field(gt=0)] = 20.0
-    """Measured deceleration to a lower set-point, rad/s^2"""
+    """Measured deceleration to a lower set-point (rad/s^2)"""
     quick_deceleration: Annotated[float, Field(gt=0)] = 30.0
-    """Measured deceleration after `m 0 0`, which removes the motors' voltage at once, rad/s^2"""
+    """Measured deceleration after `m 0 0`, which removes the motors' voltage at once (rad/s^2)"""
     auto_stop: Annotated[float, Field(ge=0.05, le=10)] = AUTO_STOP
     """Time without a set-point after which the board stops the motors (s, `AUTO_STOP_INTERVAL`). It is compiled into
     the firmware and cannot be read: compile it with 250 ms and enter the value here
@@ -39,7 +39,7 @@ class ArduinoBridgeConfig(Schema):
     command_timeout: Seconds = 0.25
     """Age of the latest command at which the motors stop (s)"""
     boot: Annotated[float, Field(ge=0, le=10)] = 3.0
-    """Maximum time until a board answers after its port was opened, s: most boards restart then"""
+    """Maximum time until a board answers after its port was opened (s): most boards restart then"""
 
     @property
     def shafts(self) -> int:
@@ -48,7 +48,7 @@ class ArduinoBridgeConfig(Schema):
 
     @property
     def turn(self) -> float:
-        """Angle per count, rad."""
+        """Angle per count (rad)."""
         return math.tau / self.counts_per_turn
 
     @property

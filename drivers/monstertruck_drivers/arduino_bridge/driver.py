@@ -37,7 +37,7 @@ def setpoint_of(commands: Sequence[DriveCommand | None], now: int, config: Ardui
 
     Args:
         commands: latest command of each shaft, if any.
-        now: time, ns.
+        now: time (ns).
         config: signs, limits and timeouts.
     """
     mode, known = requested(commands, now, config.command_timeout)

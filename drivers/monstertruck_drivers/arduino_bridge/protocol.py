@@ -24,9 +24,9 @@ from typing import Final
 
 BOARD_BAUD: Final = 57_600
 PID_RATE: Final = 30.0
-"""Rate of the controller as published, Hz."""
+"""Rate of the controller as published (Hz)."""
 AUTO_STOP: Final = 2.0
-"""Auto-stop interval as published, s."""
+"""Auto-stop interval as published (s)."""
 LONGEST_LINE: Final = 64
 OK: Final = b"OK"
 REFUSED: Final = b"Invalid Command"

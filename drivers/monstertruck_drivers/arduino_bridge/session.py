@@ -47,7 +47,7 @@ class BoardSession:
         """Stop the motors, and wait until the board answers.
 
         Args:
-            boot: maximum boot time, s.
+            boot: maximum boot time (s).
 
         Raises:
             DeviceLostError: unplugged.

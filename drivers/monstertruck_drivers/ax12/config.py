@@ -39,7 +39,7 @@ class JointConfig(Schema):
         return min(max(steps, self.min_position), self.max_position)
 
     def angle(self, position: float) -> float:
-        """Joint angle for a position in steps, rad."""
+        """Joint angle for a position in steps (rad)."""
         return (position - self.zero) * STEP * self.direction
 
 
@@ -47,7 +47,7 @@ class AlarmConfig(Schema):
     """Recovery of a joint that lost its torque."""
 
     rest: Seconds = 3.0
-    """Waiting time after an alarm, s; doubled if it trips again."""
+    """Waiting time after an alarm (s); doubled if it trips again."""
     rest_max: Positive = 60.0
     """Maximum rest (s)."""
     settled_after: Positive = 30.0
@@ -75,15 +75,15 @@ class Ax12Config(Schema):
     slope: Literal[2, 4, 8, 16, 32, 64, 128] = 32
     """Distance from the goal at which a joint applies full torque (steps)."""
     rate: Annotated[float, Field(gt=0, le=100)] = 25.0
-    """Rate at which both joints are read, Hz; an adapter with its usual latency of 16 ms allows 31."""
+    """Rate at which both joints are read (Hz); an adapter with its usual latency of 16 ms allows 31."""
     check_interval: Positive = 1.0
     """Seconds between two checks of a joint's torque settings."""
     absent_interval: Annotated[float, Field(ge=1)] = 1.0
     """Seconds between two requests to a joint that does not answer: each costs a whole timeout."""
     return_delay: Annotated[float, Field(ge=0, le=508e-6)] = 500e-6
-    """Delay of a unit before its answer, s: a setting of the unit."""
+    """Delay of a unit before its answer (s): a setting of the unit."""
     usb_latency: Annotated[float, Field(ge=0, le=0.255)] = 0.016
-    """Latency timer of the adapter, s; 0.001 only if confirmed."""
+    """Latency timer of the adapter (s); 0.001 only if confirmed."""
     command_timeout: Annotated[float, Field(gt=0, le=5)] = 0.5
     """Age of stale joint goals (s): they are ignored and the joints hold."""
     alarm: AlarmConfig = AlarmConfig()

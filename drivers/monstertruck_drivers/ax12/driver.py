@@ -81,7 +81,7 @@ class Joint:
 
     @property
     def angle(self) -> float | None:
-        """Joint angle, rad; None while the unit does not answer."""
+        """Joint angle (rad); None while the unit does not answer."""
         return None if self._present is None else self._joint.angle(self._present.position)
 
     def goal(self, angle: float) -> bytes:

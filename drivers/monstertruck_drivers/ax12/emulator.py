@@ -309,7 +309,7 @@ class TrueJoints:
         ]
 
     def angles(self, times_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Pitch and roll of the mount, rad."""
+        """Pitch and roll of the mount (rad)."""
         pitch, roll = (
             direction * (self._bus.angles(ident, times_ns) - zero * p.STEP) for ident, zero, direction in self._joints
         )

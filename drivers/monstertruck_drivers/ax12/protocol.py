@@ -25,12 +25,12 @@ WORD_SIGN: Final = 1 << 10
 STEP: Final = math.radians(300 / POSITION_MAX)
 """Radians per position step."""
 SPEED_UNIT: Final = 0.111 * math.tau / 60
-"""Speed unit, rad/s."""
+"""Speed unit (rad/s)."""
 LOAD_UNIT: Final = 0.001
 """Load unit, as a fraction of the maximum torque."""
 VOLT_UNIT: Final = 0.1
 DELAY_UNIT: Final = 2e-6
-"""Unit of the return delay, s."""
+"""Unit of the return delay (s)."""
 
 
 class Instruction(IntEnum):

@@ -31,7 +31,7 @@ class Ax12Session:
     Args:
         link: open link to the adapter.
         clock: time.
-        timeout: returns the timeout of an exchange of a number of bytes at a baud rate, s.
+        timeout: returns the timeout of an exchange of a number of bytes at a baud rate (s).
     """
 
     def __init__(self, link: Link, clock: Clock, timeout: Callable[[int, int], float]) -> None:

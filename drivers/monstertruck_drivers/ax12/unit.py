@@ -44,7 +44,7 @@ def unit_signals(number: int) -> dict[str, SignalKind]:
 TICK: Final = 2_000_000
 """Nanoseconds of one step of the motion."""
 OVERLOAD_TIME: Final = 1.0
-"""Time of overload until the alarm, s."""
+"""Time of overload until the alarm (s)."""
 AMBIENT: Final = 25.0
 NO_ALARM: Final = Alarm(0)
 

@@ -22,7 +22,7 @@ class PackConfig(Schema):
     cells: Annotated[int, Field(ge=1, le=14)] = 6
     """Cells in series."""
     capacity_ah: Annotated[float, Field(gt=0, le=100)] = 5.0
-    """Capacity of the pack in the truck, Ah: 3.7, 4.0 or 5.0"""
+    """Capacity of the pack in the truck (Ah): 3.7, 4.0 or 5.0"""
     resistance: Annotated[float, Field(ge=0, le=1)] = 0.06
     """Resistance of cells and wiring for the sag, ohm; 5 to 15 milliohm per cell are usual. Fit it from a start of the
     motor: with half the true value the charge reads up to 0.2 too low at 100 W
@@ -30,7 +30,7 @@ class PackConfig(Schema):
     max_compensation: Volts = 1.5
     """Maximum sag attributed to the motor's current, so that a wrong current cannot hide an empty pack"""
     smoothing: Seconds = 5.0
-    """Time constant of the published voltages, s."""
+    """Time constant of the published voltages (s)."""
     low: Volts = 22.0
     """Voltage below which the pack is low."""
     low_after: Seconds = 10.0
@@ -87,7 +87,7 @@ class IioConfig(PackConfig):
     divider: Annotated[float, Field(gt=0)] = 10.0
     """Pack volts per volt at the pin; calibrate with a multimeter"""
     offset: float = 0.0
-    """Offset added to the pack voltage, V"""
+    """Offset added to the pack voltage (V)"""
     full_scale: Annotated[int, Field(gt=0)] | None = None
     """Maximum reading of the converter; None: from its scan element, or unknown"""
     rate: Annotated[float, Field(gt=0, le=50)] = 10.0

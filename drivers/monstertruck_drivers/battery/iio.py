@@ -62,7 +62,7 @@ class Channel:
         return int(_number(self.file))
 
     def volts(self, raw: int) -> float:
-        """Voltage at the pin, V."""
+        """Voltage at the pin (V)."""
         return (raw + self.offset) * self.scale / 1000
 
     def at_limit(self, raw: int) -> bool:

@@ -43,7 +43,7 @@ class BatteryVerdict(NamedTuple):
 
     level: BatteryLevel
     voltage: float | None = None
-    """Smoothed voltage, V; None while the sensor is faulty or too few samples exist."""
+    """Smoothed voltage (V); None while the sensor is faulty or too few samples exist."""
     rest_voltage: float | None = None
     """``voltage`` without the sag (V)."""
 
@@ -72,7 +72,7 @@ class BatteryJudge:
 
         Args:
             time_ns: time of the sample; must not decrease.
-            voltage: pack voltage, V; NaN: the converter was at an end of its scale.
+            voltage: pack voltage (V); NaN: the converter was at an end of its scale.
             current: motor current (A), either sign; None: unknown, no sag is removed. The pack current is smaller at
                 low motor speed, and includes the electronics: both effects are within the table's error.
         """
@@ -168,7 +168,7 @@ class BatteryMonitor:
 
         The converter reads 0 or full scale, so a wire of the divider is disconnected.
 
-        ``current`` flows into the pack, A; None if not measured.
+        ``current`` flows into the pack (A); None if not measured.
         """
         verdict = self._judge.update(stamp, float("nan") if at_limit else volts, self._motor_current(stamp))
         level, rest = verdict.level, verdict.rest_voltage

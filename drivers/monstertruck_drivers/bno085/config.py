@@ -18,7 +18,7 @@ class Bno085Config(Schema):
     average: Annotated[int, Field(ge=1, le=20)] = 2
     """Frames averaged in one message; the unit sends 100 frames a second"""
     delay: Annotated[float, Field(ge=0, le=0.5)] = 0.006
-    """Delay from the measurement to the last byte of its frame, s: 19 bytes and the unit's filter"""
+    """Delay from the measurement to the last byte of its frame (s): 19 bytes and the unit's filter"""
     silence: Annotated[float, Field(gt=0, le=10)] = 0.3
     """Seconds without a frame after which the session ends"""
     stuck_after: Annotated[int, Field(ge=2, le=10_000)] = 100

@@ -40,12 +40,12 @@ class RvcFrame(NamedTuple):
 
     @property
     def angles(self) -> Xyz:
-        """Yaw, pitch and roll, rad."""
+        """Yaw, pitch and roll (rad)."""
         return self.yaw * _ANGLE, self.pitch * _ANGLE, self.roll * _ANGLE
 
     @property
     def acceleration(self) -> Xyz:
-        """Specific force, m/s^2."""
+        """Specific force (m/s^2)."""
         return self.x * _FORCE, self.y * _FORCE, self.z * _FORCE
 
 

@@ -25,7 +25,7 @@ class EposConfig(Schema):
     """Whether driving forward needs negative rpm."""
 
     max_motor_rpm: Annotated[int, Field(gt=0, le=100_000)] = 18_000
-    """Maximum set-point, rpm; also written to the controller as its limit."""
+    """Maximum set-point (rpm); also written to the controller as its limit."""
     acceleration_rpm_s: RpmPerSecond = 60_000
     """Acceleration of the motor (rpm/s)."""
     deceleration_rpm_s: RpmPerSecond = 200_000
@@ -39,7 +39,7 @@ class EposConfig(Schema):
     """Motor type: 1 brushed DC, 10 sinusoidal EC, 11 block commutated EC; None: not checked."""
 
     rate: Annotated[float, Field(ge=1, le=25)] = 20.0
-    """Feedback rate, Hz; one cycle needs four exchanges of 10 to 13 ms at 38400 baud."""
+    """Feedback rate (Hz); one cycle needs four exchanges of 10 to 13 ms at 38400 baud."""
     status_period: Seconds = 0.1
     """Interval between readings of the controller's status (s)."""
     current_period: Annotated[float, Field(gt=0, le=2)] = 0.2
@@ -56,7 +56,7 @@ class EposConfig(Schema):
     fault_reset_window: Seconds = 10.0
     """Time in which ``fault_resets`` are counted (s)."""
     fault_reset_pause: Seconds = 0.3
-    """Pause between two fault resets, s."""
+    """Pause between two fault resets (s)."""
 
     @property
     def motor_limits(self) -> MotorLimits:

@@ -52,7 +52,7 @@ def setpoint_of(command: DriveCommand | None, now: int, config: EposConfig) -> S
 
     Args:
         command: latest command, if any.
-        now: time, ns.
+        now: time (ns).
         config: sign, limits and timeouts.
 
     Returns:
@@ -102,7 +102,7 @@ class Odometer:
 
         Args:
             raw: position of the controller, signed 32 bits.
-            now: time of the reading, ns.
+            now: time of the reading (ns).
             fastest: maximum motor speed, counts/s.
 
         Returns:
@@ -230,7 +230,7 @@ class _DriveSession:
         self._prepared = False
         """Whether mode and profile are set as configured."""
         self._commands_after = self._clock.now()
-        """Time before which commands are ignored, ns."""
+        """Time before which commands are ignored (ns)."""
         self._goal = State.UNKNOWN
         self._goal_since = 0
         self._late_reported = False

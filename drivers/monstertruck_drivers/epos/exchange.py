@@ -89,9 +89,9 @@ class Exchanger:
         self.acknowledged = False
         """True once a device has answered as an EPOS does."""
         self.began = 0
-        """Time of the first byte of the latest exchange, ns."""
+        """Time of the first byte of the latest exchange (ns)."""
         self.ended = 0
-        """Time of the last byte of the latest complete exchange, ns."""
+        """Time of the last byte of the latest complete exchange (ns)."""
         self.durations: deque[int] = deque(maxlen=RECENT)
         """Durations of the latest complete exchanges (ns)."""
         self._frame_timeout: float | None = None
@@ -103,7 +103,7 @@ class Exchanger:
         self._silence = QUIET
         """Silence required after the latest failure (s)."""
         self._touched = 0
-        """Time of the latest byte from either side, ns."""
+        """Time of the latest byte from either side (ns)."""
 
     async def read(self, entry: ObjectEntry, attempts: int = 1) -> int:
         """Read the value of an object.

@@ -160,7 +160,7 @@ class Firmware:
     """The controller itself.
 
     Args:
-        now: time, ns.
+        now: time (ns).
         motor: shaft with its load.
         rng: random numbers for noise and delays of the states.
     """

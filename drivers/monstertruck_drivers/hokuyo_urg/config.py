@@ -32,7 +32,7 @@ class ScipConfig(ScannerConfig):
     first_scan_periods: Annotated[float, Field(gt=1)] = 16.0
     """Number of scan intervals allowed for the first scan after starting."""
     line_timeout: Annotated[float, Field(gt=0)] = 0.14
-    """Maximum silence within the answer to a command, s."""
+    """Maximum silence within the answer to a command (s)."""
     verify_timeout: Annotated[float, Field(gt=0)] = 10.0
     """Time limit for the sensor to verify a suspected internal fault (s, statuses 21-49)."""
     clock_samples: Annotated[int, Field(ge=1, le=100)] = 12

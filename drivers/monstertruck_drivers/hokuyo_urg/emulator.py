@@ -136,7 +136,7 @@ ORDERED: Final = {"BM": "laser_on", "MD": "stream", "MS": "stream", "QT": "quit"
 RANGE: Final = "range"
 """All distances of a scan, mm."""
 COUNTER: Final = "counter"
-"""Time stamp of a scan, ms."""
+"""Time stamp of a scan (ms)."""
 
 Handler = Callable[[str, str], tuple[str, list[bytes]]]
 """Answers a request and its note by a status and lines."""
@@ -165,7 +165,7 @@ class HokuyoEmulator(FaultyDevice):
             in time-adjust mode by a dead host.
         serial: ``SERI`` of VV.
         firmware: ``FIRM`` of VV; a major number below 3 knows SCIP 1.1 only.
-        timer_start: counter at construction, ms.
+        timer_start: counter at construction (ms).
         drift_ppm: rate error of the sensor's clock; positive runs faster than the world.
         jitter: maximum delay of a scan by USB batching (s).
         min_step: first measuring step (``AMIN``); default: value of the model.
@@ -222,7 +222,7 @@ class HokuyoEmulator(FaultyDevice):
             },
         )
         self._elapsed = 0
-        """Sensor's time at ``_born``, ns."""
+        """Sensor's time at ``_born`` (ns)."""
         self._covers: list[tuple[slice, Cover]] = []
         self._order: ScanOrder | None = None
         self._statuses: deque[int] = deque()
@@ -321,7 +321,7 @@ class HokuyoEmulator(FaultyDevice):
         return self._elapsed + round((self._clock.now() - self._born) * self._rate)
 
     def _world_time(self, time: int) -> int:
-        """The world's time at a time of the sensor's clock, ns."""
+        """The world's time at a time of the sensor's clock (ns)."""
         return self._born + round((time - self._elapsed) / self._rate)
 
     def _counter(self, time: int) -> int:

@@ -27,7 +27,7 @@ from monstertruck_runtime.clock import SECOND, Clock
 RANGE: Final = "range"
 """Distances of a packet, mm."""
 COUNTER: Final = "counter"
-"""Time stamp, ms."""
+"""Time stamp (ms)."""
 
 
 class Ld19Emulator(FaultyDevice):

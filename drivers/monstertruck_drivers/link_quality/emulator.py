@@ -35,7 +35,7 @@ class NetworkEmulator(FaultyDevice):
         self._files = FileTree(root)
         self._clock = clock
         self._signal: Callable[[int], float | None] = lambda _: -55.0
-        """dBm at an instant, ns; None: out of reach."""
+        """dBm at an instant (ns); None: out of reach."""
         self._style = "normal"
         self._present = True
         self.faults = FaultTable(

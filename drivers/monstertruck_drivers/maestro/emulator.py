@@ -162,7 +162,7 @@ class MaestroEmulator(FaultyDevice):
         )
         self._drift = rail_drift_v
         self._decoder = Decoder(device_number, crc)
-        """Delays of the next answers, s."""
+        """Delays of the next answers (s)."""
         self._powered = True
         self._fed_again = asyncio.Event()
         self._levels = dict.fromkeys(outputs, False)

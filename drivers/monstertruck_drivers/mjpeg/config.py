@@ -18,9 +18,9 @@ class MjpegConfig(Schema):
     poll: Annotated[float, Field(gt=0, le=30)] | None = None
     """Pictures to fetch a second, where ``http`` gives a single one; null: it streams"""
     width: Annotated[int, Field(ge=16, le=4096)] = 640
-    """Width that the camera is set to, pixels; others are reported"""
+    """Width that the camera is set to (pixels); others are reported"""
     height: Annotated[int, Field(ge=16, le=4096)] = 480
-    """Height that the camera is set to, pixels"""
+    """Height that the camera is set to (pixels)"""
     rate: Annotated[float, Field(gt=0, le=120)] = 15.0
     """Pictures a second that the camera is set to"""
     delay: Annotated[float, Field(ge=0, le=1)] = 0.0

@@ -20,8 +20,8 @@ def level_field(field: tuple[Real, Real, Real], pitch: Real, roll: Real, iron: I
 
     Args:
         field: measured along the device's x (forward), y (left), z (up).
-        pitch: nose down positive (REP 103), rad.
-        roll: right side down positive, rad.
+        pitch: nose down positive (REP 103) (rad).
+        roll: right side down positive (rad).
         iron: what to take out; hard iron in the unit of ``field``.
     """
     x, y = field[0] - iron.hard_x, field[1] - iron.hard_y

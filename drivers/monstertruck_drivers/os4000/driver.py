@@ -45,7 +45,7 @@ class Os4000Driver:
         self._events = events
         self._refusing = False
         self._written: dict[Key, int] = {}
-        """When each setting was written, ns."""
+        """When each setting was written (ns)."""
 
     async def run(self, ready: Ready) -> None:
         """Serve one session.

@@ -98,7 +98,7 @@ class Pca9685Emulator(FaultyDevice):
         self._halted: set[int] = set()
         """Channels that sleep stopped."""
         self._awake_at = 0
-        """When the oscillator runs, ns."""
+        """When the oscillator runs (ns)."""
 
     # Interface to the simulated world
 

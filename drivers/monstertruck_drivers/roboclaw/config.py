@@ -32,5 +32,5 @@ class RoboclawConfig(Schema):
 
     @property
     def count(self) -> float:
-        """Angle of one count, rad."""
+        """Angle of one count (rad)."""
         return math.tau / self.counts_per_turn

@@ -293,7 +293,7 @@ class Decoded(NamedTuple):
     turns: Array
     """Angles, (n,), turns."""
     ranges: Array
-    """(n,), m; 0 = no return."""
+    """(n,) (m); 0 = no return."""
     qualities: NDArray[np.uint8]
     """(n,)."""
 

@@ -29,7 +29,7 @@ class MountedScans:
     Args:
         out: publisher of the scans.
         mount: mount of the lidar.
-        hidden: hidden sectors: first and last bearing counter-clockwise, rad.
+        hidden: hidden sectors: first and last bearing counter-clockwise (rad).
     """
 
     def __init__(self, out: Publisher[LaserScan], mount: Mount, hidden: Sequence[tuple[float, float]]) -> None:

@@ -18,7 +18,7 @@ from monstertruck_runtime.clock import SECOND, Clock
 RANGE: Final = "range"
 """Distances of a scan, mm."""
 COUNTER: Final = "counter"
-"""Time stamp, ms."""
+"""Time stamp (ms)."""
 
 
 class SheetLidarEmulator(FaultyDevice):

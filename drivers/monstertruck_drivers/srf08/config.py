@@ -59,7 +59,7 @@ class Srf08Config(Schema):
     range_max: Annotated[float, Field(gt=0, le=6)] = 3.0
     """m."""
     field_of_view: Annotated[float, Field(gt=0, le=3.1416)] = 0.87
-    """Full opening angle of the cones, rad"""
+    """Full opening angle of the cones (rad)"""
     gain: Annotated[int, Field(ge=0, le=31)] = 16
     """Maximum gain; a higher gain detects weaker echoes, but also echoes of the previous ping"""
     speed_of_sound: Annotated[float, Field(gt=300, lt=380)] = 343.0

@@ -50,7 +50,7 @@ class StepperConfig(Schema):
 
     @property
     def turn(self) -> float:
-        """Angle of a step, rad."""
+        """Angle of a step (rad)."""
         return 2.0 * math.pi / self.steps_per_turn
 
     @property

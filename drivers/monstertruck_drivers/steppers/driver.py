@@ -54,7 +54,7 @@ def setpoint_of(commands: Sequence[DriveCommand | None], now: int, config: Stepp
 
     Args:
         commands: latest command of every shaft, if any.
-        now: time, ns.
+        now: time (ns).
         config: signs, limits and time-outs.
     """
     mode, known = requested(commands, now, config.quick_stop_after)

@@ -6,15 +6,12 @@ answers every complete line of the host once, with the request's sequence number
 first word of a request is a capital letter, of its answer the same in small:
 
 ======================= ==================================================== ==========================================
-request                 meaning                                              answer
-======================= ==================================================== ==========================================
-``I SEQ``               who are you                                          ``i SEQ NAME VERSION MOTORS STEPS PERIOD``
-``C SEQ ACC QUICK WD``  ramps, steps/s^2; watchdog, ms; only while at rest   ``c SEQ ACC QUICK WD``
-``R SEQ RATE...``       run at rates, 1/1000 step/s each; feeds the watchdog a status
-``Q SEQ``               quick stop, then hold                                a status
-``D SEQ``               coils off                                            a status
-``S SEQ``               look, without feeding the watchdog                   a status
-======================= ==================================================== ==========================================
+request meaning answer ======================= ====================================================
+========================================== ``I SEQ`` who are you ``i SEQ NAME VERSION MOTORS STEPS PERIOD`` ``C SEQ ACC
+QUICK WD`` ramps, steps/s^2; watchdog (ms); only while at rest ``c SEQ ACC QUICK WD`` ``R SEQ RATE...`` run at rates,
+1/1000 step/s each; feeds the watchdog a status ``Q SEQ`` quick stop, then hold a status ``D SEQ`` coils off a status
+``S SEQ`` look, without feeding the watchdog a status =======================
+==================================================== ==========================================
 
 NAME is STEP4, VERSION 1; step periods are multiples of PERIOD us. The watchdog is 50 to 2000 ms. After power-up the
 motors are off at position 0, with 4000 and 8000 steps/s^2 and 500 ms.

@@ -85,7 +85,7 @@ class VescConfig(Schema):
     quick_stop_deceleration_rpm_s: Annotated[float, Field(gt=0)] = 15_000.0
     """Deceleration by brake_current, as measured, rpm/s"""
     brake_current: Annotated[float, Field(gt=0, le=200)] = 20.0
-    """Current of the quick stop and of the controller's watchdog, A"""
+    """Current of the quick stop and of the controller's watchdog (A)"""
     standstill_rpm: Annotated[float, Field(gt=0, le=10_000)] = 60.0
     """Slower than this counts as at rest"""
     servo: VescServoConfig | None = None

@@ -51,7 +51,7 @@ def setpoint_of(commands: Sequence[DriveCommand | None], now: int, config: VescC
 
     Args:
         commands: latest command of every shaft, if any.
-        now: time, ns.
+        now: time (ns).
         config: limits and time-outs.
     """
     mode, known = requested(commands, now, config.command_timeout)

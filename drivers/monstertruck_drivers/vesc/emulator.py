@@ -241,7 +241,7 @@ class VescEmulator(FaultyDevice):
             servos.attach(self)
 
     def pulse_us(self, channel: int, time_ns: int) -> float | None:
-        """Pulse at the servo output, which is channel 0, us; see ``PulseSource``."""
+        """Pulse at the servo output, which is channel 0 (us); see ``PulseSource``."""
         del time_ns
         if channel != 0 or self.position is None:
             return None

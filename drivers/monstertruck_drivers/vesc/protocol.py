@@ -17,7 +17,7 @@ SHORT: Final = 2
 LONG: Final = 3
 STOP: Final = 3
 MAX_PAYLOAD: Final = 512
-"""Longest payload of the firmware, bytes."""
+"""Longest payload of the firmware (bytes)."""
 TICKS_PER_ELECTRICAL_TURN: Final = 6
 """Steps of the tachometer in one electrical turn."""
 SERVO_SCALE: Final = 1000.0
@@ -124,12 +124,12 @@ def request(packet: PacketId) -> bytes:
 
 
 def set_rpm(erpm: int) -> bytes:
-    """Payload that makes the speed controller hold an electrical speed, rpm."""
+    """Payload that makes the speed controller hold an electrical speed (rpm)."""
     return struct.pack(">Bi", PacketId.SET_RPM, erpm)
 
 
 def set_current(amperes: float) -> bytes:
-    """Payload that drives with a current, A; with 0 the motor coasts."""
+    """Payload that drives with a current (A); with 0 the motor coasts."""
     return struct.pack(">Bi", PacketId.SET_CURRENT, round(1000 * amperes))
 
 
@@ -186,9 +186,9 @@ class MotorValues:
     duty: float
     """-1..1."""
     erpm: int
-    """Electrical speed, rpm."""
+    """Electrical speed (rpm)."""
     volts: float
-    """Supply, V."""
+    """Supply (V)."""
     tachometer: int
     """Sixths of electrical turns since power-up, signed 32 bits, wraps."""
     tachometer_abs: int

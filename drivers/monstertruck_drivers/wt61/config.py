@@ -15,7 +15,7 @@ class Wt61Config(Schema):
     average: Annotated[int, Field(ge=1, le=20)] = 2
     """Measurements averaged in one message; the unit takes 100 a second"""
     delay: Annotated[float, Field(ge=0, le=0.5)] = 0.008
-    """Age of a measurement when its last byte arrives, s: 33 bytes and the unit's filter"""
+    """Age of a measurement when its last byte arrives (s): 33 bytes and the unit's filter"""
     silence: Annotated[float, Field(gt=0, le=10)] = 0.3
     """Seconds without a measurement that end the session"""
     stuck_after: Annotated[int, Field(ge=2, le=10_000)] = 50

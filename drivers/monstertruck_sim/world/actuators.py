@@ -6,7 +6,7 @@ from math import copysign, exp, floor, pi, radians
 from monstertruck_sim.world.config import MotorConfig, ServoModelConfig
 
 RPM = 2 * pi / 60
-"""One revolution per minute, rad/s."""
+"""One revolution per minute (rad/s)."""
 
 
 class Shaft:
@@ -15,7 +15,7 @@ class Shaft:
     def __init__(self, config: MotorConfig) -> None:
         self._config = config
         self.target: float | None = None
-        """Speed that it ramps towards, rpm; None: the power stage is off."""
+        """Speed that it ramps towards (rpm); None: the power stage is off."""
         self._acceleration = 0.0
         self.turns = 0.0
         self.rpm = 0.0
@@ -70,13 +70,13 @@ class Servo:
         self._right_stop = -radians(config.right_stop_deg)
         self._held_us: float | None = None
         self._target = 0.0
-        """Angle that the arm turns to, rad."""
+        """Angle that the arm turns to (rad)."""
         self._elapsed = 0.0
         """s."""
         self._due: deque[tuple[float, float]] = deque()
         """When (s) the angles (rad) of newer pulses become the target."""
         self.angle = 0.0
-        """Angle of the arm, rad."""
+        """Angle of the arm (rad)."""
 
     def latch(self, pulse_us: float | None) -> None:
         """Take over one pulse; None (no pulses) leaves the arm where it is."""

@@ -28,7 +28,7 @@ class BatteryModel:
         self._config = config
         self._slow_sag = 0.0
         self.current = 0.0
-        """Current into the pack, A."""
+        """Current into the pack (A)."""
         self.connected = True
         """Its plug is in."""
         self.set_charge(config.charge)

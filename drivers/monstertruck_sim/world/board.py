@@ -64,11 +64,11 @@ def held(board: HeldBoard, place: CameraPlace, rng: np.random.Generator, field_o
 
 
 def panel_ranges(panel: FlatPanel, origin: Array, directions: Array) -> Array:
-    """Return the range of each beam to a panel, (n,), m; inf for a miss.
+    """Return the range of each beam to a panel, (n,) (m); inf for a miss.
 
     Args:
         panel: panel in the map frame.
-        origin: origin of the beams in the map frame, (3,), m.
+        origin: origin of the beams in the map frame, (3,) (m).
         directions: unit vectors in the map frame, (n, 3).
     """
     normal = np.cross(panel.right, panel.down)

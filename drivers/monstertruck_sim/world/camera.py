@@ -180,7 +180,7 @@ class Painter:
 
     Args:
         config: lens and mount.
-        size: width and height, pixels.
+        size: width and height (pixels).
         wall_height: m.
     """
 

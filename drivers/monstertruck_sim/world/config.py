@@ -28,19 +28,19 @@ class ServoModelConfig(Schema):
     channel: Annotated[int, Field(ge=0, le=5)]
     """Output of the servo controller."""
     centre_us: Positive = 1439.2
-    """Pulse of the straight servo arm, us."""
+    """Pulse of the straight servo arm (us)."""
     us_per_degree: float = -10.48
-    """Pulse change per degree of servo angle, us."""
+    """Pulse change per degree of servo angle (us)."""
     rate: Positive = 6.0
     """Maximum servo speed, rad/s (0.17 s for 60 degrees)."""
     dead_time: NotNegative = 0.0
-    """Delay from a new pulse to the first movement, s."""
+    """Delay from a new pulse to the first movement (s)."""
     lag: NotNegative = 0.0
-    """Time constant of the arm's movement, s; 0: the arm turns at its maximum speed"""
+    """Time constant of the arm's movement (s); 0: the arm turns at its maximum speed"""
     dead_band_us: NotNegative = 2.0
-    """Smallest pulse change that moves the servo, us."""
+    """Smallest pulse change that moves the servo (us)."""
     resolution_us: Positive = 1.0
-    """Resolution of the servo's pulse measurement, us."""
+    """Resolution of the servo's pulse measurement (us)."""
     left_stop_deg: Annotated[float, Field(gt=0, le=180)] = 45.0
     """Angle of the arm's mechanical stop on the left."""
     right_stop_deg: Annotated[float, Field(gt=0, le=180)] = 45.0
@@ -55,9 +55,9 @@ class MotorConfig(Schema):
     ratio: Positive = 644.0
     """Motor turns per wheel turn."""
     lag: Positive = 0.02
-    """Time constant of the controller's speed loop, s."""
+    """Time constant of the controller's speed loop (s)."""
     drivetrain_lag: Positive = 0.08
-    """Time constant of the wheels' response to the motor (wind-up of gears, shafts and tyres), s."""
+    """Time constant of the wheels' response to the motor (wind-up of gears, shafts and tyres) (s)."""
     clutch_force: Positive = 25.0
     """Pull at the ground that makes the slipper clutch slip, N (less than the grip of 35 N: wheels never spin)."""
     coast_rpm_s: Positive = 30_000.0
@@ -67,15 +67,15 @@ class MotorConfig(Schema):
     efficiency: Annotated[float, Field(gt=0, le=1)] = 0.5
     """Efficiency of all gear stages together."""
     idle_current: NotNegative = 0.08
-    """No-load current of the turning motor, A."""
+    """No-load current of the turning motor (A)."""
     peak_current: NotNegative = 2.0
-    """Current limit of the controller, drawn by a blocked motor, A."""
+    """Current limit of the controller, drawn by a blocked motor (A)."""
     rotor_inertia: NotNegative = 1e-6
     """Moment of inertia of the rotor, kg m^2."""
     winding_resistance: NotNegative = 2.0
-    """Resistance of the winding, ohm."""
+    """Resistance of the winding (ohm)."""
     current_noise: NotNegative = 0.01
-    """Standard deviation of the measured current, A."""
+    """Standard deviation of the measured current (A)."""
 
 
 class AxleConfig(Schema):
@@ -108,13 +108,13 @@ class SkidModelConfig(Schema):
     wheel_gains: Annotated[tuple[Positive, ...], Field(strict=False)] = ()
     """Ratio of effective to nominal wheel radius per shaft, as motors and wheels are not identical; empty: all 1"""
     reversal_turn: float = 0.0
-    """Mean turn at each reversal of the direction of travel, left positive, rad"""
+    """Mean turn at each reversal of the direction of travel, left positive (rad)"""
     reversal_spread: NotNegative = 0.0
-    """Standard deviation of ``reversal_turn``, rad"""
+    """Standard deviation of ``reversal_turn`` (rad)"""
     drift_x: float = 0.0
-    """Slide along x of the map frame while the wheels turn, m/s"""
+    """Slide along x of the map frame while the wheels turn (m/s)"""
     drift_y: float = 0.0
-    """Slide along y of the map frame while the wheels turn, m/s"""
+    """Slide along y of the map frame while the wheels turn (m/s)"""
 
 
 class SimTruckConfig(Schema):
@@ -137,17 +137,17 @@ class SimTruckConfig(Schema):
     rear_stiffness: Positive = 120.0
     """Cornering stiffness of the rear axle's tyres, N/rad; single-track model only"""
     wheelbase: Positive = 0.32
-    """Wheelbase, m."""
+    """Wheelbase (m)."""
     track: Positive = 0.26
-    """Track, m."""
+    """Track (m)."""
     wheel_radius: Positive = 0.075
-    """Wheel radius, m."""
+    """Wheel radius (m)."""
     length: Positive = 0.47
-    """Length of the footprint, centred on the geometric centre, m."""
+    """Length of the footprint, centred on the geometric centre (m)."""
     width: Positive = 0.34
-    """Width of the footprint, m."""
+    """Width of the footprint (m)."""
     mass: Positive = 7.25
-    """Mass of the robot, kg."""
+    """Mass of the robot (kg)."""
     rolling_resistance: NotNegative = 0.05
     """Rolling resistance as a fraction of the weight."""
     front_slip_angle: NotNegative = 0.06
@@ -155,7 +155,7 @@ class SimTruckConfig(Schema):
     rear_slip_angle: NotNegative = 0.04
     """Rear slip angle per lateral acceleration, rad per m/s^2; less than in front: the truck understeers slightly."""
     slip_angle_noise: NotNegative = 0.004
-    """Standard deviation of the random part of each axle's slip angle, rad."""
+    """Standard deviation of the random part of each axle's slip angle (rad)."""
     slip_per_newton: NotNegative = 0.0005
     """Longitudinal slip ratio per N of pull."""
     slip_noise: NotNegative = 0.005
@@ -217,28 +217,28 @@ class MechanicsConfig(Schema):
     """Masses, springs and friction of the truck for engine ``mujoco``; the total mass is ``truck.mass``."""
 
     wheel_mass: Positive = 0.281
-    """Mass of one wheel, kg."""
+    """Mass of one wheel (kg)."""
     axle_mass: Positive = 0.45
-    """Mass of one axle without its wheels, kg."""
+    """Mass of one axle without its wheels (kg)."""
     mass_height: Positive = 0.12
-    """Height of the centre of the sprung mass above the ground, m."""
+    """Height of the centre of the sprung mass above the ground (m)."""
     wheel_width: Positive = 0.08
-    """Width of a wheel, m."""
+    """Width of a wheel (m)."""
     droop: Positive = 0.010
-    """Downward travel of an axle from its rest position to its stop, m."""
+    """Downward travel of an axle from its rest position to its stop (m)."""
     bump: Positive = 0.030
-    """Upward travel of an axle from its rest position to its stop, m."""
+    """Upward travel of an axle from its rest position to its stop (m)."""
     damping: Positive = 0.35
     """Damping ratio of the suspension (1: critical)."""
     axle_roll_deg: Annotated[float, Field(gt=0, le=45)] = 10.0
-    """Maximum roll of an axle relative to the chassis, degrees."""
+    """Maximum roll of an axle relative to the chassis (degrees)."""
     friction: Positive = 0.5
     """Coefficient of friction between tyres and ground."""
     tyre_stiffness: NotNegative = 60.0
     """Force of one rolling tyre per slip angle, N/rad (half the axle stiffness of the single-track model), and per
     slip ratio, N, for small slip; 0: rigid wheels"""
     relaxation: Annotated[float, Field(ge=0.01)] = 0.04
-    """Relaxation length of a tyre, m"""
+    """Relaxation length of a tyre (m)"""
 
 
 class BatteryModelConfig(Schema):
@@ -247,31 +247,31 @@ class BatteryModelConfig(Schema):
     cells: Annotated[int, Field(ge=1, le=14)] = 6
     """Cells in series."""
     capacity_ah: Positive = 5.0
-    """Capacity, Ah."""
+    """Capacity (Ah)."""
     charge: Fraction = 0.95
     """Initial charge as a fraction of the capacity."""
     resistance: NotNegative = 0.08
-    """Instantaneous resistance of cells and wiring, ohm."""
+    """Instantaneous resistance of cells and wiring (ohm)."""
     recovery_resistance: NotNegative = 0.04
-    """Resistance of the additional sag that builds up and recovers with ``recovery_time``, ohm."""
+    """Resistance of the additional sag that builds up and recovers with ``recovery_time`` (ohm)."""
     recovery_time: Positive = 20.0
-    """Time constant of the additional sag, s."""
+    """Time constant of the additional sag (s)."""
     electronics_w: NotNegative = 25.0
-    """Constant load of computer, sensors and hubs, W."""
+    """Constant load of computer, sensors and hubs (W)."""
     divider: Positive = 10.0
     """Pack volts per volt at the analog input."""
     channel: Annotated[int, Field(ge=0, le=5)] = 5
     """Analog input of the servo controller."""
     analog_offset: float = 0.0
-    """Offset at the analog input due to the voltage drop along the ground wire, V."""
+    """Offset at the analog input due to the voltage drop along the ground wire (V)."""
     filter_time: Positive = 0.1
-    """Time constant of the divider's RC low-pass, s."""
+    """Time constant of the divider's RC low-pass (s)."""
     analog_noise: NotNegative = 0.003
-    """Standard deviation of the voltage at the analog input, V."""
+    """Standard deviation of the voltage at the analog input (V)."""
     current_channel: Annotated[int, Field(ge=0, le=5)] | None = None
     """Analog input with a Hall sensor of the current into the pack; null: none."""
     current_zero: float = 2.5
-    """Voltage of that sensor at no current, V."""
+    """Voltage of that sensor at no current (V)."""
     volts_per_amp: Positive = 0.1
     """Sensitivity of that sensor, V/A."""
 
@@ -280,31 +280,31 @@ class LidarConfig(Schema):
     """True mount and faults of the lidar. The emulated device defines beam directions, rate and range."""
 
     x: float = 0.14
-    """Distance of the mount ahead of the geometric centre, m."""
+    """Distance of the mount ahead of the geometric centre (m)."""
     y: float = 0.0
-    """Distance to the left of the geometric centre, m."""
+    """Distance to the left of the geometric centre (m)."""
     yaw: float = 0.0
-    """Direction of the middle beam, left positive, rad."""
+    """Direction of the middle beam, left positive (rad)."""
     pitch: float = 0.0
-    """Pitch of the scanning plane on the mount, nose down positive, rad."""
+    """Pitch of the scanning plane on the mount, nose down positive (rad)."""
     roll: float = 0.0
-    """Roll of the scanning plane on the mount, right side down positive, rad."""
+    """Roll of the scanning plane on the mount, right side down positive (rad)."""
     height: Positive = 0.25
-    """Height of the scanning plane above the ground, m."""
+    """Height of the scanning plane above the ground (m)."""
     first_step: Annotated[int, Field(ge=0, le=768)] = 44
     """First measuring step of a URG-04LX, 0..768."""
     last_step: Annotated[int, Field(ge=0, le=768)] = 725
     """Last measuring step of a URG-04LX, 0..768."""
     min_range: NotNegative | None = None
-    """Minimum range, m; null: from the device's data sheet."""
+    """Minimum range (m); null: from the device's data sheet."""
     max_range: Positive | None = None
-    """Maximum range, m; null: from the device's data sheet."""
+    """Maximum range (m); null: from the device's data sheet."""
     accuracy_sigmas: Positive = SIGMAS
     """Error bound of the data sheet in standard deviations."""
     dropout: Fraction = 0.002
     """Probability that a single beam fails."""
     wall_height: Positive = 0.6
-    """Height of everything in the map, m; beams tilted upwards may pass over it."""
+    """Height of everything in the map (m); beams tilted upwards may pass over it."""
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
@@ -319,19 +319,19 @@ class CameraConfig(Schema):
     """True mount, lens and noise of the webcam."""
 
     x: float = 0.18
-    """Distance of the mount ahead of the geometric centre, m."""
+    """Distance of the mount ahead of the geometric centre (m)."""
     y: float = 0.0
-    """Distance to the left of the geometric centre, m."""
+    """Distance to the left of the geometric centre (m)."""
     height: Positive = 0.25
-    """Height above the ground, m."""
+    """Height above the ground (m)."""
     yaw: float = 0.0
-    """Viewing direction, left positive, rad."""
+    """Viewing direction, left positive (rad)."""
     pitch: float = 0.0
-    """Pitch, downwards positive, rad."""
+    """Pitch, downwards positive (rad)."""
     roll: float = 0.0
-    """Roll, right side down positive, rad."""
+    """Roll, right side down positive (rad)."""
     field_of_view: Annotated[float, Field(gt=0.1, lt=2.5)] = radians(63.0)
-    """Horizontal field of view of the lens without distortion, rad."""
+    """Horizontal field of view of the lens without distortion (rad)."""
     k1: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
     """Radial distortion coefficient, second order."""
     k2: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
@@ -345,7 +345,7 @@ class CameraConfig(Schema):
     blur: Annotated[float, Field(ge=0, le=10)] = 0.0
     """Standard deviation of the defocus, in pixels."""
     reach: Positive = 30.0
-    """Maximum drawing distance, m."""
+    """Maximum drawing distance (m)."""
     rendered: bool = False
     """Whether to render images in three dimensions with shadows (40 ms each in software); engine mujoco only."""
 
@@ -356,15 +356,15 @@ class TagConfig(Schema):
     tag: Annotated[int, Field(ge=0, le=586)]
     """Tag number."""
     x: float
-    """x of the tag's centre in the map, m."""
+    """x of the tag's centre in the map (m)."""
     y: float
-    """y of the tag's centre in the map, m."""
+    """y of the tag's centre in the map (m)."""
     z: float = 0.25
-    """Height above the ground, m."""
+    """Height above the ground (m)."""
     yaw: float = 0.0
-    """Direction the tag faces, rad; for a lying tag, the direction of its upper edge."""
+    """Direction the tag faces (rad); for a lying tag, the direction of its upper edge."""
     size: Annotated[float, Field(gt=0.01, le=1)] = 0.1
-    """Side of the black square, m."""
+    """Side of the black square (m)."""
     lies: bool = False
     """Whether the tag lies, facing upwards."""
 
@@ -373,24 +373,24 @@ class ChargerConfig(Schema):
     """Charging contacts on the ground, too low for lidar and camera, with the robot's pose for charging."""
 
     x: float
-    """x of the robot's geometric centre on the contacts, m."""
+    """x of the robot's geometric centre on the contacts (m)."""
     y: float
     """y of the robot's geometric centre on the contacts (m)."""
     yaw: float = 0.0
-    """Heading of the robot, rad."""
+    """Heading of the robot (rad)."""
     tolerance: Positive = 0.015
     """Maximum distance from that pose for closed contacts (m)."""
     turn_tolerance: Positive = 0.035
     """Maximum heading error for closed contacts (rad)."""
     current: NotNegative = 3.0
-    """Charging current, A; 0: the charger is off."""
+    """Charging current (A); 0: the charger is off."""
 
 
 class HeldBoard(BoardConfig):
     """A ChArUco board that a person holds in front of a camera, changing its pose at intervals."""
 
     hold: Annotated[float, Field(ge=0.05, le=60)] = 1.5
-    """Duration of each pose, s"""
+    """Duration of each pose (s)"""
     printed_scale: Annotated[float, Field(gt=0.1, lt=10)] = 1.0
     """Ratio of the true board size to the sizes above"""
 
@@ -401,13 +401,13 @@ class RoofTag(Schema):
     tag: Annotated[int, Field(ge=0, le=586)]
     """Number of the tag in its family."""
     x: float = 0.0
-    """Distance of the tag's centre ahead of the geometric centre, m."""
+    """Distance of the tag's centre ahead of the geometric centre (m)."""
     y: float = 0.0
-    """Distance to the left of the geometric centre, m."""
+    """Distance to the left of the geometric centre (m)."""
     z: float = 0.3
-    """Height above the ground, m."""
+    """Height above the ground (m)."""
     size: Annotated[float, Field(gt=0.01, le=1)] = 0.08
-    """Side of the black square, m."""
+    """Side of the black square (m)."""
 
 
 class Iron(Schema):
@@ -433,17 +433,17 @@ class CompassModelConfig(Schema):
     """OS4000 on the body; its axes are x forward, y left, z up."""
 
     north_yaw: float = 1.5707963267948966
-    """Direction of magnetic north in the map frame, rad."""
+    """Direction of magnetic north in the map frame (rad)."""
     horizontal_field: Positive = 250.0
     """Horizontal field strength, mG."""
     vertical_field: float = -390.0
     """Vertical field, upwards positive, mG (northern hemisphere: downwards)."""
     deviation_deg: NotNegative = 0.4
-    """Maximum error of the deviation curve, which is fixed and smooth over the heading, degrees."""
+    """Maximum error of the deviation curve, which is fixed and smooth over the heading (degrees)."""
     noise_deg: NotNegative = 0.1
-    """Standard deviation of heading, pitch and roll, degrees."""
+    """Standard deviation of heading, pitch and roll (degrees)."""
     tilt_bias_deg: NotNegative = 0.2
-    """Maximum fixed error of pitch and of roll, degrees."""
+    """Maximum fixed error of pitch and of roll (degrees)."""
     motor_field: float = 5.0
     """Field along the device's y per ampere of motor current, mG/A (1.1 degrees at 1 A)."""
     temperature_c: float = 25.0
@@ -468,7 +468,7 @@ class MountConfig(Schema):
 
 
 class SonarPlace(Schema):
-    """Sonar mount: position relative to the geometric centre, m, and direction of the axis, left positive, rad."""
+    """Sonar mount: position relative to the geometric centre, m, and direction of the axis, left positive (rad)."""
 
     x: float
     y: float
@@ -497,19 +497,19 @@ class SonarModelConfig(Schema):
     model: Literal["beam", "cone"] = "cone"
     """Model of the echoes."""
     field_of_view: Annotated[float, Field(gt=0, lt=3)] = 0.87
-    """Full opening angle of the cone, rad."""
+    """Full opening angle of the cone (rad)."""
     range_min: NotNegative = 0.15
-    """Minimum range, m; nearer objects are reported at this range."""
+    """Minimum range (m); nearer objects are reported at this range."""
     range_max: Positive = 3.0
-    """Maximum range, m."""
+    """Maximum range (m)."""
     noise: NotNegative = 0.005
-    """Standard deviation of a range, m."""
+    """Standard deviation of a range (m)."""
     noise_share: NotNegative = 0.01
     """Range-proportional standard deviation, as a fraction of the range; added to ``noise`` in quadrature."""
     dropout: Fraction = 0.0
     """Probability that an echo is missed."""
     critical_angle: Annotated[float, Field(gt=0, le=1.5708)] = 0.45
-    """Maximum angle from a wall's normal at which sound returns, rad; ``cone`` only."""
+    """Maximum angle from a wall's normal at which sound returns (rad); ``cone`` only."""
     cross_talk: bool = True
     """Whether a sonar hears the pings of others; ``cone`` only."""
     audible: Positive = 6.0
@@ -517,7 +517,7 @@ class SonarModelConfig(Schema):
     sonars: dict[FrameId, SonarPlace] = FIVE_SONARS
     """Sonar mounts by name."""
     height: NotNegative = 0.12
-    """Height of all sonars above the ground, m; on a leaning body some sonars look over the walls."""
+    """Height of all sonars above the ground (m); on a leaning body some sonars look over the walls."""
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
@@ -533,15 +533,15 @@ class ImuModelConfig(Schema):
     """IMU at the geometric centre; axes x forward, y left, z up."""
 
     rate_noise: NotNegative = 0.003
-    """Standard deviation of each angular velocity, rad/s."""
+    """Standard deviation of each angular velocity (rad/s)."""
     rate_bias: NotNegative = 0.01
-    """Maximum fixed error of each angular velocity, rad/s."""
+    """Maximum fixed error of each angular velocity (rad/s)."""
     rate_scale: Positive = 1.0
     """Scale factor of the measured rate about z."""
     acceleration_noise: NotNegative = 0.05
-    """Standard deviation of each acceleration, m/s^2."""
+    """Standard deviation of each acceleration (m/s^2)."""
     acceleration_bias: NotNegative = 0.1
-    """Maximum fixed error of each acceleration, m/s^2."""
+    """Maximum fixed error of each acceleration (m/s^2)."""
     temperature_c: float = 30.0
     """Temperature that the device reports, degrees Celsius."""
 
@@ -556,17 +556,17 @@ class RoughPatch(Schema):
     """A rectangle of rough ground: waves along x and along y, added to the height of the ground."""
 
     x: float
-    """x of the centre, m."""
+    """x of the centre (m)."""
     y: float
-    """y of the centre, m."""
+    """y of the centre (m)."""
     length: Positive = 1.0
-    """Length along x, m."""
+    """Length along x (m)."""
     width: Positive = 1.0
-    """Width along y, m."""
+    """Width along y (m)."""
     height: Positive = 0.02
-    """Amplitude, m."""
+    """Amplitude (m)."""
     wavelength: Positive = 0.45
-    """Wavelength, m."""
+    """Wavelength (m)."""
 
 
 class SinusoidTilt(Schema):
@@ -574,11 +574,11 @@ class SinusoidTilt(Schema):
 
     kind: Literal["sinusoid"]
     pitch_deg: float = 15.0
-    """Pitch amplitude, nose down positive, degrees."""
+    """Pitch amplitude, nose down positive (degrees)."""
     roll_deg: float = 0.0
-    """Roll amplitude, right side down positive, degrees; lags pitch by a quarter period."""
+    """Roll amplitude, right side down positive (degrees); lags pitch by a quarter period."""
     frequency: Positive = 0.5
-    """Frequency, Hz."""
+    """Frequency (Hz)."""
 
 
 class SteadyTilt(Schema):
@@ -586,16 +586,16 @@ class SteadyTilt(Schema):
 
     kind: Literal["steady"]
     pitch_deg: float = 0.0
-    """Pitch, nose down positive, degrees."""
+    """Pitch, nose down positive (degrees)."""
     roll_deg: float = 0.0
-    """Roll, right side down positive, degrees."""
+    """Roll, right side down positive (degrees)."""
 
 
 TiltConfig = Annotated[GroundTilt | SinusoidTilt | SteadyTilt, Field(discriminator="kind")]
 
 
 class Spot(Schema):
-    """Position in the map frame, m."""
+    """Position in the map frame (m)."""
 
     x: float
     y: float
@@ -607,13 +607,13 @@ class PersonConfig(Schema):
     waypoints: Annotated[tuple[Spot, ...], Field(strict=False)] = ()
     """Way-points, walked in a loop from the first. Empty: random, from the seed"""
     speed: Annotated[float, Field(gt=0, le=3)] = 0.8
-    """Mean speed, m/s; each leg is up to a fifth slower or faster"""
+    """Mean speed (m/s); each leg is up to a fifth slower or faster"""
     radius: Annotated[float, Field(gt=0, le=1)] = 0.2
-    """Radius of the cylinder, m"""
+    """Radius of the cylinder (m)"""
     pause: NotNegative = 2.0
-    """Mean pause at a way-point, s"""
+    """Mean pause at a way-point (s)"""
     distance: NotNegative = 0.8
-    """Distance kept from robots and other people ahead, m"""
+    """Distance kept from robots and other people ahead (m)"""
     before: Literal["stop", "turn", "walk_on"] = "stop"
     """Reaction to a robot or person ahead: stop and turn back after 3 s; turn aside; or keep walking until contact"""
 
@@ -629,13 +629,13 @@ class Hills(Schema):
 
     kind: Literal["hills"]
     height: NotNegative = 0.05
-    """Standard deviation of the height, m."""
+    """Standard deviation of the height (m)."""
     wavelength: Annotated[float, Field(ge=0.15)] = 2.0
-    """Shortest wavelength, m."""
+    """Shortest wavelength (m)."""
     seed: Annotated[int, Field(ge=0)] = 1
     """Seed of the ground."""
     flat: NotNegative = 0.5
-    """Radius of level ground around the start of every robot in the world, m."""
+    """Radius of level ground around the start of every robot in the world (m)."""
 
 
 class Slope(Schema):
@@ -643,15 +643,15 @@ class Slope(Schema):
 
     kind: Literal["slope"]
     x: float = 0.0
-    """x of the foot of the slope, m."""
+    """x of the foot of the slope (m)."""
     y: float = 0.0
-    """y of the foot of the slope, m."""
+    """y of the foot of the slope (m)."""
     direction: float = 0.0
-    """Uphill direction, rad."""
+    """Uphill direction (rad)."""
     angle_deg: Annotated[float, Field(ge=-40, le=40)] = 10.0
-    """Angle of the slope, uphill positive, degrees."""
+    """Angle of the slope, uphill positive (degrees)."""
     length: Positive = 2.0
-    """Horizontal length, m."""
+    """Horizontal length (m)."""
 
 
 class UprightStep(Schema):
@@ -659,17 +659,17 @@ class UprightStep(Schema):
 
     kind: Literal["step"]
     x: float
-    """x of the centre, m."""
+    """x of the centre (m)."""
     y: float
-    """y of the centre, m."""
+    """y of the centre (m)."""
     yaw: float = 0.0
-    """Yaw, rad."""
+    """Yaw (rad)."""
     length: Positive = 0.1
-    """Length, m."""
+    """Length (m)."""
     width: Positive = 1.0
-    """Width, m."""
+    """Width (m)."""
     height: Positive = 0.03
-    """Height, m."""
+    """Height (m)."""
 
 
 class Ditch(Schema):
@@ -677,17 +677,17 @@ class Ditch(Schema):
 
     kind: Literal["ditch"]
     x: float
-    """x of the centre, m."""
+    """x of the centre (m)."""
     y: float
-    """y of the centre, m."""
+    """y of the centre (m)."""
     yaw: float = 0.0
-    """Direction along the ditch, rad."""
+    """Direction along the ditch (rad)."""
     length: Positive = 2.0
-    """Length, m."""
+    """Length (m)."""
     width: Positive = 0.3
-    """Width at the top, m."""
+    """Width at the top (m)."""
     depth: Positive = 0.05
-    """Depth, m."""
+    """Depth (m)."""
 
 
 class Rubble(Schema):
@@ -695,19 +695,19 @@ class Rubble(Schema):
 
     kind: Literal["rubble"]
     x: float = 0.0
-    """x of the rectangle's centre, m."""
+    """x of the rectangle's centre (m)."""
     y: float = 0.0
-    """y of the rectangle's centre, m."""
+    """y of the rectangle's centre (m)."""
     length: Positive = 2.0
-    """Length along x, m."""
+    """Length along x (m)."""
     width: Positive = 2.0
-    """Width along y, m."""
+    """Width along y (m)."""
     count: Annotated[int, Field(ge=1, le=200)] = 40
     """Number of stones."""
     height: Positive = 0.04
-    """Height of the highest stone, m."""
+    """Height of the highest stone (m)."""
     size: Positive = 0.25
-    """Longest side, m."""
+    """Longest side (m)."""
     seed: Annotated[int, Field(ge=0)] = 1
     """Seed of the stones."""
 
@@ -718,13 +718,13 @@ class HeightImage(Schema):
     file: Path
     """PNG file, 8 or 16 bit"""
     resolution: Positive = 0.05
-    """Side of a pixel, m."""
+    """Side of a pixel (m)."""
     height: float = 1.0
-    """Height of a white pixel, m."""
+    """Height of a white pixel (m)."""
     x: float = 0.0
-    """x of the lower left corner, m."""
+    """x of the lower left corner (m)."""
     y: float = 0.0
-    """y of the lower left corner, m."""
+    """y of the lower left corner (m)."""
 
 
 GroundFeature = Annotated[Hills | Slope | UprightStep | Ditch | Rubble, Field(discriminator="kind")]

@@ -11,7 +11,7 @@ from monstertruck_kinematics.elementary import Array
 
 @dataclass(frozen=True, slots=True)
 class Disc:
-    """An upright cylinder: centre and radius in the map frame, m."""
+    """An upright cylinder: centre and radius in the map frame (m)."""
 
     x: float
     y: float
@@ -20,7 +20,7 @@ class Disc:
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """An upright box: centre (m) and yaw (rad) in the map frame, length along its own x, width along its own y, m."""
+    """An upright box: centre (m) and yaw (rad) in the map frame, length along its own x, width along its own y (m)."""
 
     x: float
     y: float
@@ -29,7 +29,7 @@ class Box:
     yaw: float = 0.0
 
     def corners(self) -> Array:
-        """Corners in the map frame, (4, 2), counter-clockwise, m."""
+        """Corners in the map frame, (4, 2), counter-clockwise (m)."""
         c, s = cos(self.yaw), sin(self.yaw)
         local = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * (self.length / 2, self.width / 2)
         corners: Array = local @ np.array([(c, s), (-s, c)]) + (self.x, self.y)

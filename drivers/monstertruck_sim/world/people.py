@@ -95,7 +95,7 @@ class Person:
         self._trail.append((now_ns, self.x, self.y))
 
     def places(self, times_ns: Array) -> Array:
-        """Return the centres at elapsed times within the last 0.8 s: (2, n), m."""
+        """Return the centres at elapsed times within the last 0.8 s: (2, n) (m)."""
         if not self._trail:
             return np.repeat([[self.x], [self.y]], len(times_ns), axis=1)
         at, xs, ys = np.array(self._trail, dtype=float).T

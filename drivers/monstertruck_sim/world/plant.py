@@ -123,7 +123,7 @@ class Plant(ABC):
 
     @property
     def attitude(self) -> tuple[float, float]:
-        """Pitch (nose down positive) and roll (right side down positive), rad."""
+        """Pitch (nose down positive) and roll (right side down positive) (rad)."""
         return self._attitude
 
     @property
@@ -244,7 +244,7 @@ class Plant(ABC):
         self.battery.step(dt, watts, self._charging())
 
     def _charging(self) -> float:
-        """Return the current of the charger whose contacts the robot stands on, A."""
+        """Return the current of the charger whose contacts the robot stands on (A)."""
         x, y, yaw = self._pose
         for charger in self.chargers:
             off, turn = hypot(x - charger.x, y - charger.y), remainder(yaw - charger.yaw, 2 * pi)

@@ -133,15 +133,15 @@ def cast_rays(
 
     Args:
         clear: ``clearance`` of the grid, (rows, columns), row 0 lowest y; outside the grid is free.
-        resolution: cell side, m.
-        origin_x: x of the grid's lower left corner in the map frame, m.
+        resolution: cell side (m).
+        origin_x: x of the grid's lower left corner in the map frame (m).
         origin_y: y of the grid's lower left corner in the map frame (m).
-        xs: (n,) ray origins in the map frame, m: one per ray, so that a sensor may move during its sweep.
+        xs: (n,) ray origins in the map frame (m): one per ray, so that a sensor may move during its sweep.
         ys: (n,) as ``xs``.
-        angles: (n,) ray directions in the map frame, rad.
+        angles: (n,) ray directions in the map frame (rad).
         reach: maximum distance (m).
-        discs: (k, 3) of x, y, radius in the map frame, m.
-        segments: (m, 4) of x0, y0, x1, y1 in the map frame, m.
+        discs: (k, 3) of x, y, radius in the map frame (m).
+        segments: (m, 4) of x0, y0, x1, y1 in the map frame (m).
 
     Returns:
         (n,) float64; 0 where a ray starts inside an occupied cell or a disc.
@@ -168,10 +168,10 @@ def grid_penetration(
 
     Args:
         occupied: (rows, columns), row 0 lowest y.
-        resolution: cell side, m.
+        resolution: cell side (m).
         x: centre of the rectangle, m, relative to the grid's lower left corner.
         y: as ``x``.
-        yaw: direction of its length, rad.
+        yaw: direction of its length (rad).
         length: m.
         width: m.
     """

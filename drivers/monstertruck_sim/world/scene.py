@@ -263,9 +263,9 @@ class Surroundings:
         """Return the range of each ray's first hit (m); inf without a hit within ``reach``.
 
         Args:
-            xs: (n,) origins in the map frame, m.
+            xs: (n,) origins in the map frame (m).
             ys: (n,) as ``xs``.
-            angles: (n,) directions in the map frame, rad.
+            angles: (n,) directions in the map frame (rad).
             reach: m.
             times_ns: (n,) instants of the rays, rising: the others are met where they were then; None: now.
             without: name of the robot with the sensor.

@@ -151,7 +151,7 @@ def over(
         cast: horizontal ranges to the walls.
         ground: under them.
         config: configuration of the lidar.
-        origins: origins of the beams in the map frame, m.
+        origins: origins of the beams in the map frame (m).
         yaw: yaw of the robot, (n,).
         beams: directions in the robot's level frame.
         times_ns: instants of the beams.

@@ -84,7 +84,7 @@ def leaning(cast: Caster, yaw: float, pitch: float, roll: float, over: float) ->
 
     Args:
         cast: ranges to the walls in the horizontal plane, for the ray angles of a level body.
-        yaw: yaw of the body in the map frame, rad.
+        yaw: yaw of the body in the map frame (rad).
         pitch: pitch of the body, nose down positive (rad).
         roll: roll of the body, right side down positive (rad).
         over: height of the walls over the sonars (m); sound above it passes.
@@ -206,7 +206,7 @@ class SimulatedSonars:
         cast: ranges to the walls.
         config: true parameters.
         seed: seed of the noise, or None for no noise.
-        wall_height: height of the walls above the ground, m.
+        wall_height: height of the walls above the ground (m).
         solids: objects that sonars detect in addition to the walls, or None.
     """
 

@@ -64,12 +64,12 @@ class Terrain:
         """Return the horizontal distances of the beams' hits on the ground; inf without a hit within ``reach``.
 
         Args:
-            xs: origins, (n,), m.
+            xs: origins, (n,) (m).
             ys: y of the origins.
             zs: z of the origins.
-            headings: directions in the plane, (n,), rad.
+            headings: directions in the plane, (n,) (rad).
             rises: metres upwards a metre of horizontal distance, (n,).
-            reach: longest horizontal distance, m.
+            reach: longest horizontal distance (m).
         """
         step = 0.05  # horizontal distance between two samples along a beam, m
         ways = np.arange(0.0, reach + step, step)

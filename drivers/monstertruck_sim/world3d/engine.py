@@ -189,7 +189,7 @@ class RigidEchoes:
 
     Args:
         plant: the robot, in its model.
-        height: height of the sonars over the ground, m.
+        height: height of the sonars over the ground (m).
     """
 
     def __init__(self, plant: RigidPlant, height: float) -> None:

@@ -32,7 +32,7 @@ HEIGHT_STEP: Final = 0.05
 """Spacing of the height field's points (m)."""
 
 Bounds = tuple[float, float, float, float]
-"""Minimum and maximum x, then y, m."""
+"""Minimum and maximum x, then y (m)."""
 
 
 def ground_heights(

@@ -19,8 +19,8 @@ class HeightGrid:
 
     Args:
         z: heights, (rows, columns), row 0 at the lowest y (m).
-        resolution: distance of two points, m.
-        origin: x, y of the first point, m.
+        resolution: distance of two points (m).
+        origin: x, y of the first point (m).
     """
 
     z: Array
@@ -34,7 +34,7 @@ class HeightGrid:
         return np.asarray(_heights(self.z, self.resolution, *self.origin, *flat)).reshape(shape)
 
     def between(self, x0: float, y0: float, x1: float, y1: float) -> tuple[float, float]:
-        """Minimum and maximum height of the points in and around a rectangle, m."""
+        """Minimum and maximum height of the points in and around a rectangle (m)."""
         rows, columns = self.z.shape
         first = floor((y0 - self.origin[1]) / self.resolution), floor((x0 - self.origin[0]) / self.resolution)
         last = floor((y1 - self.origin[1]) / self.resolution) + 2, floor((x1 - self.origin[0]) / self.resolution) + 2
@@ -47,12 +47,12 @@ class HeightGrid:
         """Return the horizontal distances of the beams' hits on the ground; inf without a hit within ``reach``.
 
         Args:
-            xs: origins, (n,), m.
+            xs: origins, (n,) (m).
             ys: y of the origins.
             zs: z of the origins.
-            headings: directions in the plane, (n,), rad.
+            headings: directions in the plane, (n,) (rad).
             rises: metres upwards a metre of horizontal distance, (n,).
-            reach: longest horizontal distance, m.
+            reach: longest horizontal distance (m).
         """
         return np.asarray(_cast(self.z, self.resolution, *self.origin, xs, ys, zs, headings, rises, reach))
 

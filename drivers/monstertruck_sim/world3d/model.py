@@ -28,7 +28,7 @@ TIMESTEP: Final = 0.002
 SPARE: Final = 24
 """Discs, and boxes, that can be put into a world while it runs; people and other robots are among them."""
 PARKED: Final = -50.0
-"""Height of unused spare bodies, m."""
+"""Height of unused spare bodies (m)."""
 SUPPORTS: Final = tuple(f"support_{i}" for i in range(4))
 """Blocks that can be put under wheels."""
 TALL: Final = 0.6
@@ -125,7 +125,7 @@ class StaticScene:
 
     Args:
         walls: rectangles of solid map cells, (n, 4): minimum x, minimum y, maximum x, maximum y (m).
-        wall_height: over the ground, m.
+        wall_height: over the ground (m).
         heights: heights of the ground; None: level at 0.
         blocks: on it.
         scenery: assets, and bodies and geometries, of another MJCF file.
@@ -151,8 +151,8 @@ def rectangles(solid: NDArray[np.bool_], resolution: float, origin: tuple[float,
 
     Args:
         solid: (rows, columns), row 0 lowest y.
-        resolution: side of a cell, m.
-        origin: origin of the lower left corner, m.
+        resolution: side of a cell (m).
+        origin: origin of the lower left corner (m).
         longest: side of a rectangle, cells: on uneven ground a wall follows it piece by piece.
     """
     left = solid.copy()

@@ -24,7 +24,7 @@ class CameraPose:
     """Viewpoint of a picture.
 
     Args:
-        place: place of the camera, m.
+        place: place of the camera (m).
         ahead: unit vector, the axis of the picture.
         up: unit vector, at a right angle to it.
         field_of_view: vertical angle of view (rad).
@@ -57,7 +57,7 @@ class WorldRenderer:
 
     Args:
         model: MuJoCo model.
-        width: width of the pictures, pixels.
+        width: width of the pictures (pixels).
         height: pixels.
 
     Raises:

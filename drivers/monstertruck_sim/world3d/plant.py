@@ -75,7 +75,7 @@ class RigidPlant(Plant):
         model: MuJoCo model of robot and surroundings.
         drive: its drive line.
         steering: converts servo angles to wheel angles.
-        ground: height under a point of the map, m.
+        ground: height under a point of the map (m).
         parts: its mechanics.
     """
 
@@ -126,7 +126,7 @@ class RigidPlant(Plant):
 
     @property
     def rates(self) -> Xyz:
-        """Angular velocity about forward, left and up of the level frame, rad/s."""
+        """Angular velocity about forward, left and up of the level frame (rad/s)."""
         return self._turning
 
     @property

@@ -103,9 +103,9 @@ class ExplorationSummary:
 
     end: TaskEnd[ExplorationState]
     distance: float
-    """Distance travelled, true, m."""
+    """Distance travelled, true (m)."""
     home_error: float
-    """True distance from the start at the end, m."""
+    """True distance from the start at the end (m)."""
     collided: bool
     messages: dict[str, int]
     """Number of messages by topic."""

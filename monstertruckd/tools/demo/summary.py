@@ -31,7 +31,7 @@ class Summary:
     truth: Array
     """Shape (n, 6): time s, x m, y m, yaw rad, speed m/s, stuck."""
     lateness_p99: float
-    """Lateness of the control tick, s."""
+    """Lateness of the control tick (s)."""
     lateness_max: float
     messages: dict[str, int] = field(default_factory=dict)
     """Number of messages by topic."""
@@ -66,7 +66,7 @@ class Summary:
 
     @property
     def closing_error(self) -> float:
-        """True distance between start and end of the closed lap, m."""
+        """True distance between start and end of the closed lap (m)."""
         driven = self._driven()
         return float(np.hypot(*(driven[-1, 1:3] - driven[0, 1:3])))
 

@@ -43,9 +43,9 @@ class Movement:
     turn: float
     """Turn by motor and steering, rad, left positive"""
     seen: Mapping[str, float]
-    """Turn by each sensor, rad"""
+    """Turn by each sensor (rad)"""
     distance_seen: float | None
-    """Distance by the lidar, m; None: its scans do not match, or do not determine it, as in a corridor"""
+    """Distance by the lidar (m); None: its scans do not match, or do not determine it, as in a corridor"""
 
 
 async def signs(drives: Drives, config: TruckConfig, command: Callable[..., str]) -> list[Finding]:

@@ -49,15 +49,15 @@ class DrivingStation:
     Args:
         bus: bus of the daemon.
         clock: time.
-        speed: requested, m/s.
-        front: angle of the bicycle's front axle that is requested, rad.
+        speed: requested (m/s).
+        front: angle of the bicycle's front axle that is requested (rad).
     """
 
     def __init__(self, bus: Bus, clock: VirtualClock, speed: float = 0.18, front: float = 0.0) -> None:
         self.speed = speed
         self.front = front
         self.rear = 0.0
-        """Angle of its rear axle, rad."""
+        """Angle of its rear axle (rad)."""
         self.unseen = False
         """The operator holds the second control, which lets the robot drive into unseen ground."""
         self.twist: RequestedTwist | None = None
@@ -307,7 +307,7 @@ class DrillTruck:
 
     @property
     def speed(self) -> float:
-        """True speed, m/s."""
+        """True speed (m/s)."""
         return self.observer.speed if self.judge is None else self.judge.speed
 
     def listen(self) -> None:

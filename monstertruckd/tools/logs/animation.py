@@ -43,15 +43,15 @@ class AnimationFrame:
     seconds: float
     """Since the log's begin."""
     pose: tuple[float, float, float]
-    """Base in map, m and rad."""
+    """Base in map (m, rad)."""
     speed: float
     """M/s."""
     points: Array
-    """Returns of the latest scan in map, or the middles of ``arcs``, shape (n, 2), m."""
+    """Returns of the latest scan in map, or the middles of ``arcs``, shape (n, 2) (m)."""
     path: Array
     """Poses of the current path, shape (n, 3)."""
     arcs: list[Array]
-    """Arcs of the sonars' latest echoes, in map, each of shape (n, 2), m."""
+    """Arcs of the sonars' latest echoes, in map, each of shape (n, 2) (m)."""
 
 
 @dataclass(slots=True)
@@ -59,7 +59,7 @@ class _Gathering:
     """Reads a log in its order; keeps one scene per period."""
 
     period: int
-    """Log time, ns."""
+    """Log time (ns)."""
     scans: PlacedScans = field(default_factory=PlacedScans)
     scenes: list[AnimationFrame] = field(default_factory=list)
     odometry: Odometry | None = None
@@ -205,6 +205,6 @@ class _AnimationCanvas:
         return picture.quantize(palette=self._palette, dither=Image.Dither.NONE)
 
     def _pixels(self, points: Array) -> list[tuple[float, float]]:
-        """Bounds of points in map, shape (n, 2), m."""
+        """Bounds of points in map, shape (n, 2) (m)."""
         scaled = (points - self._low) * self._scale
         return [(x, self._height - y) for x, y in scaled.tolist()]

@@ -185,7 +185,7 @@ def windows(
 
 
 def _row(entry: LogMessage, message: Message, offset: int) -> dict[str, Any]:
-    """The columns of a message; ``offset`` is real minus daemon time, ns."""
+    """The columns of a message; ``offset`` is real minus daemon time (ns)."""
     times = {LOG_TIME: entry.log_time, REAL_TIME: entry.log_time + offset}
     return {**times, **flat(message, type(message), "")}
 
@@ -195,7 +195,7 @@ def export_parquet(
 ) -> dict[str, Path]:
     """Write ``<group>_<name>.parquet`` for every topic that has messages; see the module for the columns.
 
-    Pictures are binary columns. ``log_time`` is daemon time, ns; ``real_time`` UTC.
+    Pictures are binary columns. ``log_time`` is daemon time (ns); ``real_time`` UTC.
 
     Returns:
         The files by topic.

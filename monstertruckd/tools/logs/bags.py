@@ -26,7 +26,7 @@ SCANS: Final = "foxglove.LaserScan or sensor_msgs/LaserScan"
 
 @dataclass(frozen=True, slots=True)
 class MessageTimes:
-    """MessageTimes of one message, ns."""
+    """MessageTimes of one message (ns)."""
 
     stamp: int
     """Stamp in its header."""
@@ -46,7 +46,7 @@ class BagScan:
     angle_increment: float
     time_increment: float
     ranges: Array
-    """Shape (n,), m."""
+    """Shape (n,) (m)."""
     limits: tuple[float, float] | None
     """Minimum and maximum range (m); None if not in the message."""
 

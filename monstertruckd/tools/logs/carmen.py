@@ -32,7 +32,7 @@ class _LaserLine:
     robot: Pose2
     time: float
     logged: float
-    """Time of the logger, s; infinite where the line has none."""
+    """Time of the logger (s); infinite where the line has none."""
     laser: Pose2 | None = None
     geometry: tuple[tuple[str, float], ...] = ()
 
@@ -107,7 +107,7 @@ def _count(words: list[str], at: int) -> int:
 
 
 def _times(words: list[str]) -> tuple[float, float]:
-    """Time of the message and of the logger, s."""
+    """Time of the message and of the logger (s)."""
     time, logged = float(words[0]), float(words[2]) if len(words) > 2 else math.inf
     if not math.isfinite(time):
         raise ValueError(f"time {time}")

@@ -49,7 +49,7 @@ def removed_on_failure() -> Iterator[list[Path]]:
 
 
 LOG_TIME, REAL_TIME = "log_time", "real_time"
-"""Columns of every table: daemon time and UNIX time, ns."""
+"""Columns of every table: daemon time and UNIX time (ns)."""
 
 
 def export_csv(
@@ -57,9 +57,8 @@ def export_csv(
 ) -> dict[str, Path]:
     """Write ``<group>_<name>.csv`` for every topic that has messages.
 
-    Nested records get dotted columns; arrays and lists are JSON in one cell; absent values are empty. Pictures
-    are saved as files in a folder next to the table, which names them. ``log_time`` is daemon time, ns; ``real_time``
-    UTC.
+    Nested records get dotted columns; arrays and lists are JSON in one cell; absent values are empty. Pictures are
+    saved as files in a folder next to the table, which names them. ``log_time`` is daemon time (ns); ``real_time`` UTC.
 
     Returns:
         The files by topic.

@@ -27,7 +27,7 @@ class PathQuality:
     lost: NDArray[np.bool_]
     """Shape (n,): which poses of the trajectory are lost."""
     length: float
-    """Length of the path, m."""
+    """Length of the path (m)."""
     lost_share: float
     """Share of it that is lost, 0..1."""
     odometry: dict[str, float]
@@ -81,7 +81,7 @@ def _misfit(estimate: SlamEstimate) -> bool:
 
 
 def _after(scans: Sequence[ScanInput], made: dict[int, SlamEstimate]) -> float:
-    """Distance by odometry from the first scan with the last stamp that was used to the end of the log, m."""
+    """Distance by odometry from the first scan with the last stamp that was used to the end of the log (m)."""
     last = max(made)
     rest = itertools.dropwhile(lambda scan: scan.stamp != last, scans)
     places = [scan.odom[:2] for scan in rest if scan.odom is not None]

@@ -122,7 +122,7 @@ class OpenedLog:
         Args:
             topics: names.
             at: the topic whose messages make the rows; by default the first.
-            within: greatest difference of two stamps, s; without a message so near, the row's other cells are empty.
+            within: greatest difference of two stamps (s); without a message so near, the row's other cells are empty.
             columns: names as they are in each topic's table, for those topics that have them; empty: all.
             start: s after the log's first message.
             end: as ``start``.
@@ -221,7 +221,7 @@ class OpenedLog:
         return self.pandas(t.EVENT.name, start=start, end=end)
 
     def _first(self) -> int:
-        """Daemon time of the first message, ns; 0 of an empty log."""
+        """Daemon time of the first message (ns); 0 of an empty log."""
         return next((entry.log_time for entry in self._reader), 0)
 
     def _table(self, topic: str, columns: Sequence[str], start: float, end: float) -> pa.Table:
@@ -296,7 +296,7 @@ def _nearest(stamps: NDArray[np.int64], at: NDArray[np.int64], within: float) ->
 
     Args:
         stamps: shape (n,), ns, in any order.
-        at: shape (m,), ns.
+        at: shape (m,) (ns).
         within: s.
     """
     if not len(stamps):

@@ -102,7 +102,7 @@ class Scene:
 
     Args:
         stream: recording, open.
-        offset: real minus daemon time, ns.
+        offset: real minus daemon time (ns).
     """
 
     def __init__(self, stream: rr.RecordingStream, offset: int) -> None:

@@ -13,11 +13,11 @@ from monstertruck_kinematics.se2 import Pose2, between, interpolate
 from monstertruck_runtime.clock import SECOND
 
 BEGIN: Final = SECOND
-"""Stamp of the first scan of a log with times of another origin, ns."""
+"""Stamp of the first scan of a log with times of another origin (ns)."""
 SHORTEST_RANGE: Final = 0.02
-"""Default minimum range of a return, m."""
+"""Default minimum range of a return (m)."""
 LONGEST_RANGE: Final = 80.0
-"""Ranges from here on are no-returns of the lasers that CARMEN logs come from, m."""
+"""Ranges from here on are no-returns of the lasers that CARMEN logs come from (m)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,15 +27,15 @@ class LogGeometry:
     start_angle: float | None = None
     """Angle of the first beam, rad, counter-clockwise from ahead."""
     angle_increment: float | None = None
-    """Angle between neighbouring beams, rad."""
+    """Angle between neighbouring beams (rad)."""
     range_min: float | None = None
-    """Minimum range of a return, m."""
+    """Minimum range of a return (m)."""
     range_max: float | None = None
-    """Range without a return, m."""
+    """Range without a return (m)."""
     time_increment: float | None = None
     """Seconds between neighbouring beams."""
     mount: Pose2 | None = None
-    """Planar pose of the sensor in base, m and rad."""
+    """Planar pose of the sensor in base (m, rad)."""
 
     @property
     def known(self) -> dict[str, Any]:
@@ -51,7 +51,7 @@ class ScanLog:
     make: str
     scans: list[ScanInput]
     begin: float = 0.0
-    """Time of the log's clock at stamp 0 here, s."""
+    """Time of the log's clock at stamp 0 here (s)."""
     assumed: tuple[str, ...] = field(default=())
     """Parts of the geometry that neither the log nor the caller gave."""
     fault: str | None = None
@@ -75,7 +75,7 @@ def no_return(ranges: Array) -> float:
     """Range without a return: a maximum that recurs, or infinity.
 
     Args:
-        ranges: ranges of any shape, at least one of them finite, m.
+        ranges: ranges of any shape, at least one of them finite (m).
     """
     finite = ranges[np.isfinite(ranges)]
     greatest = float(finite.max())
@@ -102,7 +102,7 @@ def steady_clock(*clocks: NDArray[np.int64]) -> tuple[int, NDArray[np.int64]]:
     the most different times, and scans of one time are spread evenly up to the next.
 
     Args:
-        clocks: times of the scans by each clock, shape (n,), ns.
+        clocks: times of the scans by each clock, shape (n,) (ns).
 
     Returns:
         Number of the clock, and times by it.

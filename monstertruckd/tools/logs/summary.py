@@ -180,7 +180,7 @@ def _first_date(reader: LogReader) -> str | None:
 
 
 def _offset(reader: LogReader) -> int:
-    """Real time minus the file's log time, ns."""
+    """Real time minus the file's log time (ns)."""
     reader.metadata()  # passes the metadata that names the clock of the log times
     try:
         return real_offset(reader) - reader.log_offset

@@ -30,11 +30,11 @@ class EstimateError:
     position_rms: float
     """m"""
     position_end: float
-    """Position error at the last pose, with the frames aligned at the first ones, m"""
+    """Position error at the last pose, with the frames aligned at the first ones (m)"""
     heading_rms: float
     """rad"""
     latency: float | None
-    """Delay of the stand's stamps relative to the estimate, s; None: too little turn to determine it"""
+    """Delay of the stand's stamps relative to the estimate (s); None: too little turn to determine it"""
 
 
 def errors_of(log: LogReader) -> list[EstimateError]:
@@ -64,7 +64,7 @@ def errors_of(log: LogReader) -> list[EstimateError]:
 
 
 def tracker_errors(log: LogReader) -> dict[str, float] | None:
-    """Distance from the path reported by the tracker, m; None if none drove."""
+    """Distance from the path reported by the tracker (m); None if none drove."""
     reports: list[Any] = [entry.decode() for entry in log if entry.topic == TRACKER.name]
     off = [abs(report.cross_track) for report in reports]
     if not off:
@@ -95,7 +95,7 @@ def error_of(what: str, seen: Array, estimate: Array) -> EstimateError:
 
 
 def latency_of(seen: Array, estimate: Array) -> float | None:
-    """Delay of the stand's stamps, s; None: hardly any turn."""
+    """Delay of the stand's stamps (s); None: hardly any turn."""
     yaw, other = np.unwrap(seen[:, 3]), np.unwrap(estimate[:, 3])
     if np.ptp(yaw) < 0.5:  # least turn to determine the latency, rad
         return None

@@ -34,16 +34,16 @@ class CameraCalibration(Schema):
     """One camera."""
 
     matrix: Numbers
-    """3 x 3, row-major, pixels"""
+    """3 x 3, row-major (pixels)"""
     distortion: Numbers
     """k1, k2, p1, p2, k3"""
     size: Annotated[tuple[int, int], Field(strict=False)]
     rotation: Numbers
     translation: Numbers
     lens_rms: float
-    """RMS error of the board's corners, pixels"""
+    """RMS error of the board's corners (pixels)"""
     place_rms: float
-    """RMS error of the marks, m"""
+    """RMS error of the marks (m)"""
     boards: int
     marks: int
 
@@ -54,7 +54,7 @@ class StandCalibration(Schema):
     version: Literal[1] = 1
     cameras: dict[str, CameraCalibration]
     overlap_rms: float | None
-    """RMS difference between cameras of a mark that several see, m; None: no mark is seen by two"""
+    """RMS difference between cameras of a mark that several see (m); None: no mark is seen by two"""
 
     def placed(self) -> dict[str, PlacedCamera]:
         """For use."""
@@ -62,12 +62,12 @@ class StandCalibration(Schema):
 
 
 def middles(sightings: Sequence[Sighting]) -> dict[int, Array]:
-    """Middle of each tag, pixels: where the diagonals cross, which perspective keeps."""
+    """Middle of each tag (pixels): where the diagonals cross, which perspective keeps."""
     return {sighting.tag: _crossing(sighting.corners) for sighting in sightings}
 
 
 def seen_marks(pictures: Sequence[Picture]) -> dict[int, Array]:
-    """Centres of tags, averaged over pictures of a still scene, pixels."""
+    """Centres of tags, averaged over pictures of a still scene (pixels)."""
     found: dict[int, list[Array]] = {}
     for picture in pictures:
         for tag, middle in middles(TagReader(everywhere=1).read(picture)).items():
@@ -98,9 +98,9 @@ def check_places(
 
     Args:
         placed: camera, by all of its marks.
-        seen: middles of its marks, pixels.
+        seen: middles of its marks (pixels).
         marks: marks by tag.
-        ruler: standard deviation of a mark's place, m.
+        ruler: standard deviation of a mark's place (m).
 
     Raises:
         InputError: a mark is elsewhere; names the mark whose removal makes the others fit, else the three worst.
@@ -140,9 +140,9 @@ def join(
 
     Args:
         cameras: placed one by one.
-        seen: middles of marks by camera, pixels.
+        seen: middles of marks by camera (pixels).
         marks: marks by tag.
-        ruler: standard deviation of a mark's place, m.
+        ruler: standard deviation of a mark's place (m).
     """
     names = list(cameras)
     rays = {n: {tag: cameras[n].lens.directions(px[None])[0] for tag, px in seen[n].items()} for n in names}

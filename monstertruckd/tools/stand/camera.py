@@ -16,9 +16,9 @@ class PlacedCamera:
 
     lens: Lens
     rotation: Array
-    """(3,): rotation vector from the stand's to the camera's axes, rad."""
+    """(3,): rotation vector from the stand's to the camera's axes (rad)."""
     translation: Array
-    """(3,): the stand's origin as the camera has it, m."""
+    """(3,): the stand's origin as the camera has it (m)."""
 
     @cached_property
     def axes(self) -> Array:
@@ -27,15 +27,15 @@ class PlacedCamera:
 
     @property
     def centre(self) -> Array:
-        """(3,): of the lens in the stand, m."""
+        """(3,): of the lens in the stand (m)."""
         return -self.axes.T @ self.translation
 
     def on_plane(self, pixels: Array, height: float = 0.0) -> Array:
-        """Points of a level plane that pixels show, m; (n, 2) both.
+        """Points of a level plane that pixels show (m); (n, 2) both.
 
         Args:
             pixels: seen.
-            height: height of the plane above the stand's plane, m.
+            height: height of the plane above the stand's plane (m).
         """
         return meet(self.lens.directions(pixels), self.axes, self.translation, height)
 
@@ -63,13 +63,13 @@ def rotation_matrix(vector: Array) -> Array:
 
 
 def meet(directions: Array, axes: Array, translation: Array, height: float = 0.0) -> Array:
-    """Intersections of a camera's rays with a level plane, m; (n, 2).
+    """Intersections of a camera's rays with a level plane (m); (n, 2).
 
     Args:
         directions: x and y at z = 1 of the camera, (n, 2).
         axes: axes of the camera in the stand, as rows, (3, 3).
-        translation: the stand's origin as the camera has it, m.
-        height: height of the plane, m.
+        translation: the stand's origin as the camera has it (m).
+        height: height of the plane (m).
     """
     rays = np.column_stack((directions, np.ones(len(directions)))) @ axes
     centre = -axes.T @ translation

@@ -44,7 +44,7 @@ class StandCamera(Schema):
 
 
 class MarkConfig(Schema):
-    """A tag that lies on the table for good, measured by ruler from the stand's middle, m."""
+    """A tag that lies on the table for good, measured by ruler from the stand's middle (m)."""
 
     x: float
     y: float
@@ -54,13 +54,13 @@ class MarkedRobot(Schema):
     """A robot that carries a marker."""
 
     x: float = 0.0
-    """Offset of the marker's centre ahead of the robot's centre, m"""
+    """Offset of the marker's centre ahead of the robot's centre (m)"""
     y: float = 0.0
-    """Offset of the marker's centre to the left of the robot's centre, m"""
+    """Offset of the marker's centre to the left of the robot's centre (m)"""
     yaw: float = 0.0
-    """Yaw of the marker relative to the robot, left positive, rad"""
+    """Yaw of the marker relative to the robot, left positive (rad)"""
     height: Annotated[float, Field(ge=0, le=2)] = 0.08
-    """Height of the marker over the table, m"""
+    """Height of the marker over the table (m)"""
 
 
 class TaggedRobot(MarkedRobot):
@@ -75,9 +75,9 @@ class BlobRobot(MarkedRobot):
     front: Colour
     rear: Colour
     apart: Annotated[float, Field(gt=0.03, le=1)]
-    """Distance of the discs' middles, m"""
+    """Distance of the discs' middles (m)"""
     start: Annotated[tuple[float, float] | None, Field(strict=False)] = None
-    """Its place at the start, m: for robots that look like others"""
+    """Its place at the start (m): for robots that look like others"""
 
     @model_validator(mode="after")
     def _two_colours(self) -> Self:
@@ -99,16 +99,16 @@ class OverheadConfig(Schema):
     version: Literal[2]
     cameras: Annotated[dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")], StandCamera], Field(min_length=1)]
     size: tuple[int, int] = Field((640, 480), strict=False)
-    """Width and height of the pictures, pixels"""
+    """Width and height of the pictures (pixels)"""
     rate: Annotated[float, Field(gt=0, le=120)] = 25.0
     """Pictures a second"""
     board: BoardConfig = BoardConfig()
     marks: dict[int, MarkConfig]
     """Tags on the table by number: five in sight of each camera, or more"""
     mark_size: Metres = 0.08
-    """Side of the black square of tags on the table, m"""
+    """Side of the black square of tags on the table (m)"""
     ruler_error: Annotated[float, Field(gt=0, le=0.1)] = 0.0015
-    """Standard deviation of a mark's place, m"""
+    """Standard deviation of a mark's place (m)"""
     robots: dict[Name, TaggedRobot] = {}
     """Robots with tags"""
     blobs: dict[Name, BlobRobot] = {}

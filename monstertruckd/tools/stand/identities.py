@@ -20,9 +20,9 @@ from monstertruckd.tools.stand.config import BlobRobot
 from monstertruckd.tools.stand.poses import MarkerPose, weight_of
 
 AT_START: Final = 0.15
-"""Maximum distance from its start to identify a robot that looks like others, m."""
+"""Maximum distance from its start to identify a robot that looks like others (m)."""
 UNSURE: Final = 0.5
-"""Maximum time out of sight before robots that look the same may be confused, s."""
+"""Maximum time out of sight before robots that look the same may be confused (s)."""
 
 
 class Pair(NamedTuple):
@@ -32,7 +32,7 @@ class Pair(NamedTuple):
     rear: int
     pose: MarkerPose
     off: float
-    """Difference between their distance and the robot's distance of discs, m."""
+    """Difference between their distance and the robot's distance of discs (m)."""
 
 
 @dataclass(slots=True)
@@ -67,7 +67,7 @@ class Identities:
         """Robots in one picture.
 
         Args:
-            stamp: stamp of it, ns.
+            stamp: stamp of it (ns).
             camera: that took it.
             blobs: in it.
         """
@@ -111,7 +111,7 @@ class Identities:
         ]
 
     def _cost(self, name: str, stamp: int, pair: Pair) -> float | None:
-        """How far a pair is from where a robot is expected, m; None: too far."""
+        """How far a pair is from where a robot is expected (m); None: too far."""
         place = np.array((pair.pose.x, pair.pose.y))
         start = self._robots[name].start
         at_start = None if start is None else float(np.hypot(*(place - start)))

@@ -18,13 +18,13 @@ class MarkerPose(NamedTuple):
     x: float
     y: float
     yaw: float
-    """Direction from the middle to a tag's printed upper edge, or to the front disc, rad."""
+    """Direction from the middle to a tag's printed upper edge, or to the front disc (rad)."""
     weight: float
     sigma: float
-    """Standard deviation of x and y, m."""
+    """Standard deviation of x and y (m)."""
     heading_sigma: float
     side: float
-    """Side of the tag, or distance of the discs, m."""
+    """Side of the tag, or distance of the discs (m)."""
 
 
 class RobotPose(NamedTuple):

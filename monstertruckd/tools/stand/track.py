@@ -44,7 +44,7 @@ class StandReader:
 
         Args:
             picture: next one.
-            expected: corners of robots' tags, (4, 2) each, pixels.
+            expected: corners of robots' tags, (4, 2) each (pixels).
         """
         found: list[Sighting | Blob] = []
         if self._tagged or self._count == 0 or (self._count - self._phase) % EVERYWHERE == 0:

@@ -24,19 +24,19 @@ from monstertruckd.tools.stand.identities import Identities
 from monstertruckd.tools.stand.poses import MarkerPose, RobotPose, merged, robot_pose, tag_pose
 
 EXPECTED: Final = 0.5
-"""Time that a robot's motion is extrapolated, s."""
+"""Time that a robot's motion is extrapolated (s)."""
 BLIND: Final = 5.0
-"""Maximum time without a mark before a camera counts as moved, s."""
+"""Maximum time without a mark before a camera counts as moved (s)."""
 
 
 @dataclass(slots=True)
 class _Known:
     pose: RobotPose
     side: float
-    """Side of its tag, m."""
+    """Side of its tag (m)."""
     doubts: int = 0
     rate: Array = field(default_factory=lambda: np.zeros(3))
-    """Rates of x, y and yaw, m/s and rad/s."""
+    """Rates of x, y and yaw (m/s, rad/s)."""
 
     def at(self, stamp: int) -> Array:
         """x, y and yaw that are expected, (3,)."""
@@ -49,19 +49,19 @@ class CameraState:
     """How a camera is."""
 
     heard: int
-    """Stamp of its latest picture, ns."""
+    """Stamp of its latest picture (ns)."""
     marked: int
-    """Stamp of the latest one with marks, ns."""
+    """Stamp of the latest one with marks (ns)."""
     unmarked: int = 0
     """Pictures since."""
     off: Array = field(default_factory=lambda: np.zeros(4))
-    """Smoothed `shift_of` its marks, m."""
+    """Smoothed `shift_of` its marks (m)."""
     lost: bool = False
     moved: bool = False
 
     @property
     def distance(self) -> float:
-        """Error of its marks, m."""
+        """Error of its marks (m)."""
         return float(np.sqrt(self.off @ self.off))
 
 
@@ -71,8 +71,8 @@ def shift_of(seen: Array, places: Array) -> Array:
     Errors of the ruler are independent.
 
     Args:
-        seen: where they are seen, (n, 2), m.
-        places: where they lie, (n, 2), m.
+        seen: where they are seen, (n, 2) (m).
+        places: where they lie, (n, 2) (m).
     """
     off, arms = seen - places, places - places.mean(axis=0)
     spread = math.sqrt(float(np.mean(np.sum(arms**2, axis=1))))
@@ -89,7 +89,7 @@ class StandTracker:
         cameras: placed.
         robots: with tags, by name.
         marks: tags on the table, by number.
-        now: stamp of the begin, ns.
+        now: stamp of the begin (ns).
         blobs: robots with coloured discs, by name.
     """
 
@@ -121,9 +121,9 @@ class StandTracker:
         """Poses at one instant.
 
         Args:
-            stamp: stamp of it, ns.
+            stamp: stamp of it (ns).
             pictures: tags and discs in the cameras' pictures.
-            taken: stamps of pictures that were taken before, ns: a robot is carried on by its speed.
+            taken: stamps of pictures that were taken before (ns): a robot is carried on by its speed.
         """
         seen: dict[str, list[tuple[str, MarkerPose]]] = {}
         for camera, found in pictures.items():
@@ -150,7 +150,7 @@ class StandTracker:
         return poses
 
     def expected(self, stamp: int) -> dict[str, list[Array]]:
-        """Expected corners of the robots' tags at ``stamp``, ns, by camera, (4, 2) each, pixels."""
+        """Expected corners of the robots' tags at ``stamp``, ns, by camera, (4, 2) each (pixels)."""
         squares = []
         for name, robot in self._robots.items():
             known = self._known.get(name)

@@ -19,7 +19,7 @@ from monstertruck_planners.route.motion import MotionPath
 from monstertruck_schemas.reasons import Reason
 
 CUSP_REACHED = 0.1
-"""Nearer than this to a cusp of its band the truck continues with what follows, m."""
+"""Nearer than this to a cusp of its band the truck continues with what follows (m)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,9 +29,9 @@ class BandConfig(Schema):
     significant: Positive = 0.1
     """Smaller forces are never an overshoot."""
     tiny: Positive = 0.01
-    """Bubbles up to this radius are in collision, m."""
+    """Bubbles up to this radius are in collision (m)."""
     largest: Positive = 0.4
-    """Clearance beyond which obstacles exert no force, m."""
+    """Clearance beyond which obstacles exert no force (m)."""
 
 
 class PeopleConfig(Schema):
@@ -54,23 +54,23 @@ class LocalPlannerConfig(Schema):
 
     band: BandConfig = BandConfig()
     margin: NotNegative = 0.02
-    """Kept between footprint and obstacles, m."""
+    """Kept between footprint and obstacles (m)."""
     reach: Positive = 3.0
-    """Length of the route regarded, m."""
+    """Length of the route regarded (m)."""
     inset: NotNegative = 0.1
-    """Distance between the window's border and the circle around the footprint where the route is cut, m."""
+    """Distance between the window's border and the circle around the footprint where the route is cut (m)."""
     effort: Count = 1100
     """Nodes expanded and smoothing trials of a local search: bounds the time of a cycle."""
     reverse_cost: Annotated[float, Field(ge=1)] = 3.0
-    """Cost of a metre backward, where the lidar does not look, m."""
+    """Cost of a metre backward, where the lidar does not look (m)."""
     cusp_cost: NotNegative = 0.3
-    """Cost of a change of direction, m."""
+    """Cost of a change of direction (m)."""
     crab_cost: Annotated[float, Field(ge=1)] = 1.05
-    """Cost of a metre of translation, m."""
+    """Cost of a metre of translation (m)."""
     clearance_cost: NotNegative = 0.5
-    """Extra cost of a metre in contact, falling to 0 where obstacles are 0.1 m away, m."""
+    """Extra cost of a metre in contact, falling to 0 where obstacles are 0.1 m away (m)."""
     shortest: Positive = 0.15
-    """Minimum length of the free beginning of a blocked path for driving it, m."""
+    """Minimum length of the free beginning of a blocked path for driving it (m)."""
 
 
 class RsbandConfig(LocalPlannerConfig):
@@ -80,13 +80,13 @@ class RsbandConfig(LocalPlannerConfig):
     strategy: Strategy = "start_to_next"
     """How the path joins the poses of the band."""
     sub_goal: Positive = 0.6
-    """Length of band to the goal of ``start_to_next``, m."""
+    """Length of band to the goal of ``start_to_next`` (m)."""
     spacing: Positive = 0.4
-    """Distance between the band poses that are joined one by one, m."""
+    """Distance between the band poses that are joined one by one (m)."""
     renew: Positive = 0.5
     """A path is replaced when less than this share of its length is left."""
     off_path: Positive = 0.1
-    """A path is replaced when the truck is further away from it, m."""
+    """A path is replaced when the truck is further away from it (m)."""
 
 
 class PublishedConfig(LocalPlannerConfig):
@@ -96,11 +96,11 @@ class PublishedConfig(LocalPlannerConfig):
     strategy: Strategy = "start_to_next"
     """How the path joins the poses of the band."""
     sub_goal: Positive = 0.6
-    """Length of band to the goal of ``start_to_next``, m."""
+    """Length of band to the goal of ``start_to_next`` (m)."""
     radius: Positive = 1.0
-    """Turning radius, m."""
+    """Turning radius (m)."""
     inflation: Positive = 0.3
-    """Radius of the inflation; states must lie outside of it, m."""
+    """Radius of the inflation; states must lie outside of it (m)."""
     emergency: bool = True
     """Turn by 45 degrees and more when nothing else is found."""
 
@@ -110,11 +110,11 @@ class TebConfig(LocalPlannerConfig):
 
     kind: Literal["teb"] = "teb"
     spacing: Positive = 0.1
-    """Distance between the poses, m."""
+    """Distance between the poses (m)."""
     iterations: Count = 8
     """Gauss-Newton steps in one cycle."""
     clearance: Positive = 0.1
-    """Preferred between footprint and obstacles, m."""
+    """Preferred between footprint and obstacles (m)."""
     obstacle_weight: Positive = 30.0
     """Weight of clearances below ``clearance``."""
     steering_weight: Positive = 200.0
@@ -128,10 +128,10 @@ class TebConfig(LocalPlannerConfig):
     time_weight: Positive = 0.3
     """Weight of the time."""
     speed: Positive = 0.2
-    """Forward, m/s."""
+    """Forward (m/s)."""
     reverse_speed: Positive = 0.15
-    """Backward, m/s."""
+    """Backward (m/s)."""
     acceleration: Positive = 0.5
     """m/s^2."""
     steering_rate: Positive = 1.0
-    """Maximum steering rate of an axle, rad/s."""
+    """Maximum steering rate of an axle (rad/s)."""

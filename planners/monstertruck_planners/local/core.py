@@ -34,7 +34,7 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason
 
 PATH_CUSP_REACHED = 0.02
-"""The same for a cusp of its path, m."""
+"""The same for a cusp of its path (m)."""
 
 
 @njit(cache=True)
@@ -50,7 +50,7 @@ def escape_motion(
         pose: shape (3,), of the truck, nearer to something than the margin.
         primitives: shape (n, 3): segments whose signs, curvatures and sideslips may be driven. Of equally long motions
             the first one is taken.
-        margin: wanted at the end, m.
+        margin: wanted at the end (m).
 
     Returns:
         A motion segment, shape (1, 3), or none, shape (0, 3).

@@ -31,11 +31,11 @@ class CoveringDiscs(NamedTuple):
 
     x: Array
     y: Array
-    """Centres relative to the pose, m."""
+    """Centres relative to the pose (m)."""
     radius: Array
     """m."""
     reach: float
-    """Maximum distance of a centre from the pose, m."""
+    """Maximum distance of a centre from the pose (m)."""
 
 
 class BandParameters(NamedTuple):
@@ -50,13 +50,13 @@ class BandParameters(NamedTuple):
     significant: float
     tiny: float
     largest: float
-    """Largest radius, m."""
+    """Largest radius (m)."""
     scale: float
     """Ratio of a bubble's radius to its clearance: 1; 0.5 in the published planner."""
     reach: float
     """Metres per radian between two headings; 0 in the published planner."""
     spacing: float
-    """Largest distance of neighbours, m."""
+    """Largest distance of neighbours (m)."""
     published: bool
     """Steps of a whole radius, and a previous force that counts its x twice and its y never."""
 
@@ -304,7 +304,7 @@ class BandResult:
     broken: int
     """Bubbles before the first one that touches something; their number if none does."""
     radii: Array
-    """Shape (n,), m; of the path's poses."""
+    """Shape (n,) (m); of the path's poses."""
 
 
 def cover_footprint(footprint: Footprint | DiscFootprint) -> CoveringDiscs:

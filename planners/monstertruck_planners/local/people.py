@@ -37,7 +37,7 @@ class Walker:
     """In m."""
 
     def at(self, times: Array) -> Array:
-        """Return the predicted centres at times from now (s), shape (n, 2), m."""
+        """Return the predicted centres at times from now (s), shape (n, 2) (m)."""
         return np.asarray(np.array(self.place) + times[:, None] * self.velocity)
 
     def carried(self, base: Pose2, other: Pose2) -> "Walker":
@@ -90,10 +90,10 @@ class PeopleTracker:
 
         Args:
             stamp: stamp of the scan (ns).
-            points: returns in the odometry frame, in the order of the beams, shape (n, 2), m. In the map frame a
+            points: returns in the odometry frame, in the order of the beams, shape (n, 2) (m). In the map frame a
                 correction of the robot's pose would look like people who walk.
             mapped: whether the map explains each point, shape (n,).
-            sensor: place of the lidar, shape (2,), m.
+            sensor: place of the lidar, shape (2,) (m).
 
         Returns:
             The walkers, and whether each point belongs to one, shape (n,).

@@ -43,10 +43,10 @@ WIDTH = 12
 """Unknowns that a residual may touch, and diagonals of the matrix."""
 
 LEAST_STEP = 0.01
-"""Minimum distance in an interval, m."""
+"""Minimum distance in an interval (m)."""
 
 LEAST_TIME = 0.02
-"""Shortest time of an interval, s."""
+"""Shortest time of an interval (s)."""
 
 
 class TebParameters(NamedTuple):
@@ -54,17 +54,17 @@ class TebParameters(NamedTuple):
 
     l_f: float
     l_r: float
-    """Distances of the axles before and behind the reference point, m."""
+    """Distances of the axles before and behind the reference point (m)."""
     front: float
     rear: float
     """Maximum tangents of their angles."""
     rate: float
-    """Maximum rate of both tangents, 1/s."""
+    """Maximum rate of both tangents (1/s)."""
     speed: float
     reverse: float
     acceleration: float
     clearance: float
-    """Preferred, m."""
+    """Preferred (m)."""
     w_obstacle: float
     w_steering: float
     w_rate: float

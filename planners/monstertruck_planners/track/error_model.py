@@ -47,7 +47,7 @@ def discretise(geometry: FourWheelSteering, steering: Steering, speed: float, la
         geometry: geometry of the truck.
         steering: steering mode, with one or two inputs.
         speed: forward speed (m/s).
-        lag: lag of the axles, s.
+        lag: lag of the axles (s).
         period: period (s).
     """
     basis = BASES[steering]

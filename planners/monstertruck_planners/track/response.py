@@ -18,7 +18,7 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import FourWheelSteering
 
 LAG_CELL: Final = 0.01
-"""Spacing of the history and of the candidates' dead times, s."""
+"""Spacing of the history and of the candidates' dead times (s)."""
 DEAD_TIMES: Final = 31
 """Number of candidate dead times: 0 to 0.3 s."""
 LAGS: Final = np.array((0.0, 0.05, 0.1, 0.15, 0.2))
@@ -98,7 +98,7 @@ class ResponseEstimator:
         self._end = 1
         """Number of cells written."""
         self._begin = math.nan
-        """Time of the first cell, s."""
+        """Time of the first cell (s)."""
         self._seen: tuple[float, float, float, bool] | None = None
         """Time (s), yaw (rad), speed (m/s) and kind of the last yaw."""
 

@@ -51,13 +51,13 @@ class Traffic:
 
     @property
     def nominal(self) -> float | None:
-        """Rate of the topic table, Hz."""
+        """Rate of the topic table (Hz)."""
         topic = BY_NAME.get(self.name)
         return None if topic is None else topic.rate
 
     @property
     def mean_rate(self) -> float | None:
-        """Measured rate between first and last message, Hz."""
+        """Measured rate between first and last message (Hz)."""
         return (self.messages - 1) * SECOND / (self.last - self.first) if self.last > self.first else None
 
     def take(self, message: LogMessage) -> None:
@@ -99,7 +99,7 @@ class Traffic:
 
 
 _PERIODS: Final = {t.ODOMETRY.name: SECOND // 20, t.POSE.name: SECOND // 20, t.TRANSFORMS.name: SECOND}
-"""Topics of high rate that are decoded no more often than this, ns."""
+"""Topics of high rate that are decoded no more often than this (ns)."""
 _EVENTS: Final = 400
 """Events kept of each severity."""
 
@@ -111,7 +111,7 @@ class RunSummary:
     path: Path
     size: int
     start: int = 0
-    """First and last log time, ns."""
+    """First and last log time (ns)."""
     end: int = 0
     messages: int = 0
     damage: str | None = None

@@ -78,7 +78,7 @@ def clock_text(seconds: float, decimals: int = 0) -> str:
 
 
 def line(trace: Trace, axis: Axis, start: int, end: int) -> str:
-    """SVG path data of a trace from ``start`` to ``end``, ns; intervals are drawn from extreme to extreme."""
+    """SVG path data of a trace from ``start`` to ``end`` (ns); intervals are drawn from extreme to extreme."""
     duration = max(end - start, 1)
     parts = []
     for piece in trace.pieces():
@@ -133,7 +133,7 @@ def plot(
         unit: unit of the axis.
         lines: label and trace of every line.
         axis: axis of the values.
-        span: first and last instant, ns.
+        span: first and last instant (ns).
     """
     start, end = span
     seconds = (end - start) / SECOND

@@ -56,7 +56,7 @@ class PlacedScans:
         self._mounts = FrameTree(tree.transforms)
 
     def place(self, scan: LaserScan) -> tuple[Array, Array]:
-        """Place of the lidar, shape (2,), and its returns, shape (n, 2), m; at least one pose must be known."""
+        """Place of the lidar, shape (2,), and its returns, shape (n, 2) (m); at least one pose must be known."""
         x, y, yaw = self._pose_at(scan.stamp + round(scan.scan_time / 2 * SECOND))
         mount = self._mount(scan.frame) or (0.0, 0.0, 0.0)
         cos, sin = math.cos(yaw), math.sin(yaw)
@@ -65,7 +65,7 @@ class PlacedScans:
         return at + np.array(mount[:2]) @ turn, at + scan_points(scan, mount) @ turn
 
     def arcs(self, ranges: SonarRanges) -> list[Array]:
-        """For each echo of a sonar whose place is known the arc it lies on, (n, 2), m; at least one pose is known."""
+        """For each echo of a sonar whose place is known the arc it lies on, (n, 2) (m); at least one pose is known."""
         found = []
         for echo in ranges.sonars:
             mount = self._mount(f"sonar_{echo.name}")

@@ -17,7 +17,7 @@ from monstertruck_schemas.base import Message
 from monstertruck_schemas.topics import Topic
 
 _SHORTEST_GAP = SECOND
-"""Shorter intervals without samples are never drawn as gaps, ns."""
+"""Shorter intervals without samples are never drawn as gaps (ns)."""
 
 
 @dataclass(slots=True)
@@ -54,7 +54,7 @@ class Trace:
         self.count = 0
 
     def add(self, time: int, value: float) -> None:
-        """Append a sample at ``time``, ns."""
+        """Append a sample at ``time`` (ns)."""
         self.count += 1
         self._append(Bucket(time, time, value, value, value))
         if len(self.buckets) > self._limit:
@@ -261,7 +261,7 @@ class DrivenPath:
     """Positions, sampled to a bounded number, and the distance along all of them."""
 
     points: list[tuple[int, float, float]] = field(default_factory=list)
-    """Time, ns; x, y, m."""
+    """Time (ns); x, y (m)."""
     distance: float = 0.0
     _last: tuple[float, float] | None = None
     _spacing: float = _LEAST_STEP

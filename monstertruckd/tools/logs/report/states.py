@@ -28,7 +28,7 @@ class Tone(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class StateSpan:
-    """A state that held from ``start`` to ``end``, ns."""
+    """A state that held from ``start`` to ``end`` (ns)."""
 
     start: int
     end: int
