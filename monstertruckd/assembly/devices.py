@@ -1,4 +1,4 @@
-"""Builds the drivers of a configuration: what each opens, and the ends of its role's topics."""
+"""Construction of the configured drivers: their devices, and the read and write ends of their roles' topics."""
 
 import asyncio
 from collections.abc import Mapping
@@ -57,7 +57,7 @@ class Cabling:
             role: port for role, port in self._ports.items() if role not in given and isinstance(port, UsbPortConfig)
         }
         self.on_hubs = frozenset(places)
-        """Roles of the devices that hang by hub and port."""
+        """Roles of the devices that are named by hub and port."""
         self._hubs = HubCoordinator(config.usb, places, self._machine.clock, self._events)
         self._cut = config.usb.power.cut
         self._power = PortPower(config.usb.power, self._machine, self._events)
@@ -94,7 +94,7 @@ class Cabling:
         return PathSource(port.label, self._machine.clock)
 
     async def cut(self) -> None:
-        """Switch off the ports of ``usb.power.cut`` at the same time: one that hangs or refuses holds up no other."""
+        """Switch off the ports of ``usb.power.cut`` in parallel: one that hangs or refuses delays no other."""
         ports = {role: self._ports.get(role) for role in self._cut}
         async with asyncio.TaskGroup() as group:
             for role, port in ports.items():
@@ -198,7 +198,7 @@ def measures_battery(config: TruckConfig) -> bool:
 
 
 def of_duty(drivers: Mapping[str, Service], *duties: Duty) -> dict[str, Service]:
-    """Present drivers with one of ``duties``."""
+    """Return the configured drivers with one of ``duties``."""
     return {role: driver for role, driver in drivers.items() if DEVICES.roles[role].duty in duties}
 
 

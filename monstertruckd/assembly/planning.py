@@ -146,7 +146,7 @@ def build_planners(
 
 
 def build_zones(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> ZoneService | None:
-    """Build what keeps the zones of the map; None without zones."""
+    """Build the zone service; None without zones."""
     zones = config.zones
     if zones is None:
         return None
@@ -203,7 +203,7 @@ def _build_tracker(
 
 
 def with_response(tracker: TrackerConfig, devices: Devices) -> TrackerConfig:
-    """The tracker's settings; dead time and lag come from the servos unless it has its own."""
+    """Return the tracker's settings; dead time and lag come from the servos unless configured."""
     steering = devices.steers()
     if steering is None or tracker.dead_time is not None or tracker.lag is not None:
         return tracker

@@ -1,4 +1,4 @@
-"""Who may do what over Zenoh.
+"""Access rules: the permissions of each certificate over Zenoh.
 
 Zenoh's access rules bind a name to a certificate: under ``req/<name>/...`` and ``rpc/.../<name>`` only that
 certificate's requests arrive. The daemon looks up the grant of the name. So it answers a source that requests too much,
@@ -155,7 +155,7 @@ def router_rules(fleet: Mapping[str, Iterable[str]]) -> dict[str, Any]:
 
 
 def _common(robot: str) -> list[dict[str, Any]]:
-    """What everybody may who may see the robot."""
+    """Permissions of every certificate that may see the robot."""
     seen = [f"{KEY_ROOT}/{robot}/{group}/**" for group in out_groups()]
     history = [f"{KEY_ROOT}/{robot}/{group}/*/{_SIDE_CHANNEL}" for group in out_groups()]
     descriptions = [rpc_key(robot, name) for name in _DESCRIPTIONS]
@@ -174,7 +174,7 @@ def _common(robot: str) -> list[dict[str, Any]]:
             [*seen, *history, alive_key(robot)],
         ),
         _rule("requests-out", "egress", ["declare_subscriber"], [*requests, STAND_POSE.key(robot)]),
-        # Every client may publish an observed pose of the robot: nothing in the robot reads it.
+        # Every client may publish an observed pose of the robot: no part of the robot reads it.
         _rule("stand-in", "ingress", ["put"], [STAND_POSE.key(robot)]),
         _rule("calls-out", "egress", ["declare_queryable", "reply"], calls),
     ]

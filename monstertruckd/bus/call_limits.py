@@ -59,7 +59,7 @@ class CallLimits:
         self._estops: Counter[str] = Counter()
 
     def refusal(self, name: str, source: str | None, waiting: int) -> str:
-        """Why a call is not taken; empty if it is. Each emergency stop that is taken has to be ``ended``.
+        """Return the reason for refusing a call; empty to accept it. Each accepted emergency stop must be ``ended``.
 
         Args:
             name: name of the call.

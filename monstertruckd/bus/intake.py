@@ -66,7 +66,7 @@ LIMITS: Final = {
 fits, and the map of a building: at the edges of its rooms a cell takes about one bit."""
 
 ORDER_RATE: Final = 5.0
-"""Orders a second of one owner, those that stop not counted."""
+"""Maximum number of orders per second and owner, without those that stop."""
 
 
 @dataclass(slots=True)
@@ -116,9 +116,9 @@ class OwnerRates:
 
 
 class Refusals:
-    """Reports refused requests as events, at most once a second: a flood of garbage must not become one of events.
+    """Report refused requests as events, at most once a second, so that a flood of garbage causes no flood of events.
 
-    To be made on the loop.
+    Construct it on the event loop.
 
     Args:
         bus: where the events go.
@@ -155,9 +155,9 @@ class Refusals:
 
 
 class Repeats:
-    """Holds the latest order of each owner for a moment, so that the loop receives few, however many arrive.
+    """Hold the latest order of each owner for a moment, so that the event loop receives few.
 
-    To be made on the loop.
+    Construct it on the event loop.
 
     Args:
         deliver: called on the loop with each.
@@ -200,12 +200,12 @@ class Intake:
     """Takes in the requests of one topic; to be made on the loop.
 
     Args:
-        topic: one that outsiders write.
+        topic: a topic that outsiders write.
         bus: where the requests go.
         clock: time.
-        guard: runs callbacks on the loop, so that a bug does not vanish there.
+        guard: runs callbacks on the event loop, so that their errors are reported.
         reporter: who reports refusals.
-        only: the one accepted order, on a separate path; None for all.
+        only: the accepted order, on a separate path; None for all.
     """
 
     def __init__(
@@ -318,9 +318,9 @@ class StandIntake:
     """
 
     SIZE: Final = 1024
-    """Bytes of one pose, at most."""
+    """Maximum size of one pose (bytes)."""
     RATE: Final = 120.0
-    """Poses a second, at most."""
+    """Maximum number of poses per second."""
 
     def __init__(
         self, bus: Bus, clock: Clock, guard: Callable[[Callable[[], object]], None], refusals: Refusals

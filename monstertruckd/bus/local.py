@@ -25,7 +25,7 @@ from monstertruckd.bus.outgoing import Outgoing, Sent
 M = TypeVar("M", bound=Message)
 
 TapCallback = Callable[[Topic[Any], Message, bytes, int], None]
-"""Gets every message of its topics with the bytes that stand for it outside, and when it was published (ns).
+"""Receive every message of its topics with its wire bytes and its time of publication (ns).
 
 Must not block, nor raise."""
 
@@ -68,7 +68,7 @@ class _ReadEnds:
 
     listeners: list[Callable[[Any], object]] = field(default_factory=list)
     mailboxes: tuple[Mailbox[Any], ...] = ()
-    """Replaced when one comes or goes, never changed: a message may be on its way to them."""
+    """Replaced, never changed, when a listener comes or goes: a message may be on its way to the listeners."""
     taps: int = 0
 
 
@@ -123,7 +123,7 @@ class Bus:
         return self._emit
 
     def subscribe(self, topic: Topic[M], delivery: Delivery) -> Mailbox[M]:
-        """A read end of ``topic``; for a retained topic it holds the latest message at once.
+        """Return a read end of ``topic``; for a retained topic it holds the latest message at once.
 
         Raises:
             RuntimeError: the topic is written by a test stand and must not be read in the robot.
@@ -155,7 +155,7 @@ class Bus:
             yield topic, message, wire.encode(topic, message)
 
     def tap(self, callback: TapCallback, topics: Iterable[Topic[Any]]) -> Tap:
-        """Call back with every message of ``topics``; at once with retained ones.
+        """Call ``listener`` with every message of ``topics``, first with the retained ones.
 
         All taps of a topic share one encoding; a topic without taps is never encoded.
         """
@@ -176,7 +176,7 @@ class Bus:
         Returns the listeners' results, in their order.
 
         Raises:
-            RuntimeError: ``topic`` is not one that outsiders write.
+            RuntimeError: outsiders may not write ``topic``.
         """
         if topic.writer is not Writer.OUTSIDE:
             msg = f"{topic.name} is written by {topic.writer}, not from outside"
@@ -187,7 +187,7 @@ class Bus:
         """Deliver a test stand's message to the taps alone. ``received`` becomes the daemon's own time.
 
         Raises:
-            RuntimeError: ``topic`` is not one that a stand writes.
+            RuntimeError: stands may not write ``topic``.
         """
         if topic.writer is not Writer.STAND:
             msg = f"{topic.name} is written by {topic.writer}, not by a stand"
@@ -196,7 +196,7 @@ class Bus:
 
     @property
     def drops(self) -> int:
-        """Messages lost in bounded queues since the start: all FIFO subscriptions, and what ``add_drops`` adds."""
+        """Number of messages lost in bounded queues since the start: all FIFO subscriptions, and ``add_drops``."""
         return self._drops + sum(mailbox.drops for ends in self._ends.values() for mailbox in ends.mailboxes)
 
     def add_drops(self, count: int) -> None:

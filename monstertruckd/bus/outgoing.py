@@ -17,7 +17,7 @@ BATCH: Final = 10
 """Messages delivered in one iteration of the event loop: a fraction of a millisecond."""
 
 Sent = tuple[Topic[Any], Message, int]
-"""Topic, message and the time it was sent (ns)."""
+"""Topic, message and send time (ns)."""
 
 
 class Outgoing:
@@ -48,7 +48,7 @@ class Outgoing:
             self._timer = loop.call_at(due / SECOND, self._due)
 
     def flush(self) -> None:
-        """Deliver all waiting messages; those sent meanwhile follow."""
+        """Deliver all waiting messages; messages sent during the delivery follow."""
         if self._delivering:
             return
         try:

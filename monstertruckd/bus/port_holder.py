@@ -22,7 +22,7 @@ LISTENING: Final = "0A"
 
 
 def holder_of(endpoints: Iterable[str], proc: Path = PROC) -> str:
-    """Describe who listens at one of ``endpoints``: robots by name, process by number and command line.
+    """Describe the programs that listen at one of ``endpoints``: robots by name, processes by number and command line.
 
     Returns:
         For example ``robot 'truck', process 4711 (monstertruckd run --config demo.yaml)``; of a process that this user
@@ -49,7 +49,7 @@ def _processes(endpoints: list[str], proc: Path) -> Iterator[str]:
 
 
 def _owners(endpoints: list[str], proc: Path) -> Iterator[str]:
-    """Users whose programs listen at one of the ports."""
+    """Return the users whose programs listen at one of the ports."""
     users = dict.fromkeys(int(row[7]) for endpoint in endpoints for row in _listening(endpoint, proc))
     yield from (f"a program of user {_user(number)!r}" for number in users)
 

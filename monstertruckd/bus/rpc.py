@@ -67,7 +67,7 @@ class Rpc:
         """Run one handler, for any caller.
 
         Raises:
-            NotFoundError: no such name; the text lists those there are.
+            NotFoundError: the name does not exist; the text lists the existing names.
             NoAnswerError: the handler missed its deadline and was cancelled.
             TruckError: whatever the handler refused with.
         """

@@ -59,7 +59,7 @@ class TlsConfig(Schema):
         return self
 
     def grants(self) -> dict[str, Grant]:
-        """What each name may do."""
+        """Permissions by name."""
         roles = (
             (AccessRole.PILOT, self.pilots),
             (AccessRole.OBSERVER, self.observers),
@@ -145,7 +145,7 @@ class Listener:
 
     listen: tuple[str, ...]
     places: int
-    """Sessions of others that may be open at once."""
+    """Maximum number of simultaneous client sessions."""
     connect: tuple[str, ...] = ()
     ca: Path | None = None
     """Who may connect; None: everybody."""

@@ -29,7 +29,7 @@ LASTING: Final = frozenset({Reason.FILE_DAMAGED, Reason.LOG_DAMAGED})
 
 
 class HealthBoard:
-    """Collects the state of every service; publishes the table on change and once a second.
+    """Collect the state of every service; publish the table on change and once a second.
 
     Loss and recovery of a service are events. Repeated failures within one outage are not, unless the cause changes or
     the service is given up. A device unplugged from a hub is reported at its second failure. If the whole hub is gone,
@@ -207,7 +207,7 @@ class ClockService:
 
 
 class MeterService:
-    """Publishes the lateness of control ticks and the state of the recorder once a second.
+    """Publish the lateness of control ticks and the state of the recorder once a second.
 
     Reports a disk that is too slow for the recorder as an event, at most once a minute.
     """

@@ -24,7 +24,7 @@ from monstertruckd.tools.demo.summary import log_figures
 from monstertruckd.tools.logs.report import report
 
 Report = Callable[[str, Grid | None, Pose2D | None], object]
-"""Gets a line of progress, the newest map and the robot's pose in it; None before the first."""
+"""Receives a line of progress, the latest map and the robot's pose in it; None before the first map."""
 DONE: Final = frozenset({Reason.GOAL_REACHED, Reason.EXPLORED, Reason.POINTS_FOUND})
 """Outcomes of a successful demo."""
 STARTING: Final = frozenset(
@@ -52,7 +52,7 @@ async def explore_home(
         clock: time.
         tags: end the search once one tag is in the map.
         report: gets progress every two seconds of the robot's time.
-        timeout: seconds to wait until the robot can begin.
+        timeout: maximum wait until the robot is ready (s).
 
     Raises:
         RequestRefusedError: the exploration does not start.
@@ -92,7 +92,7 @@ async def explore_home(
 
 
 def progress(state: ExplorationState) -> str:
-    """How far an exploration has come."""
+    """Progress of an exploration."""
     tags = "" if state.find is None else f", {state.found} of {state.find} tags"
     return f"{state.elapsed:5.0f} s  {state.travelled:5.1f} m  {state.known:6.1f} m^2 known{tags}  {state.phase.value}"
 
@@ -103,7 +103,7 @@ class ExplorationSummary:
 
     end: TaskEnd[ExplorationState]
     distance: float
-    """Distance travelled, true (m)."""
+    """True distance travelled (m)."""
     home_error: float
     """True distance from the start at the end (m)."""
     collided: bool

@@ -1,4 +1,4 @@
-"""Map and robot as text, which the terminal shows while a robot explores."""
+"""Map and robot as text for the terminal while a robot explores."""
 
 import math
 from types import TracebackType

@@ -36,7 +36,7 @@ from monstertruckd.tools.status.screen import draw
 from monstertruckd.tools.status.watch import SCREEN_PERIOD, Follower
 
 START_LIMIT = 60.0
-"""Seconds for the two processes to come up (the first run compiles the ray caster)."""
+"""Maximum time for the two processes to start (s); the first run compiles the ray caster."""
 
 
 def run_fast_demo(config_file: Path, folder: Path, seed: int | None, film: Path | None = None) -> Summary:
@@ -167,10 +167,10 @@ def seeks(config: SimulatedTruckConfig) -> bool:
 async def run_wall_exploration(
     clock: Clock, config_file: Path, folder: Path, seed: int | None, report: Report
 ) -> ExplorationSummary:
-    """Do the same over ptys, in real time; arguments and errors as in ``run_fast_exploration``.
+    """Run it over ptys in real time; arguments and errors as in ``run_fast_exploration``.
 
     Raises:
-        NoAnswerError: a process did not come up.
+        NoAnswerError: a process did not start.
     """
     config = load_config(config_file, SimulatedTruckConfig)[0]
     async with _served(clock, config_file, folder, seed) as client:
@@ -192,7 +192,7 @@ async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | No
         screen: whether to draw the live screen.
 
     Raises:
-        NoAnswerError: a process did not come up, or the lap was not finished.
+        NoAnswerError: a process did not start, or the lap was not finished.
     """
     given = load_tree(config).data
     async with _served(clock, config, folder, seed) as client:

@@ -51,7 +51,7 @@ class Summary:
 
     @property
     def text(self) -> str:
-        """Why the lap was given up; empty if it was driven."""
+        """Reason why the lap was given up; empty if it was driven."""
         return self.lap.text
 
     def _driven(self) -> Array:

@@ -34,7 +34,7 @@ STEERING: Final = ("4ws", "2ws")
 
 
 def robot_file(name: Path) -> Path:
-    """The configuration of a robot by its name: one of ``configs/robots`` before others of its name.
+    """Return the configuration of a robot by name; ``configs/robots`` takes precedence.
 
     Raises:
         ConfigError: there is none.
@@ -86,7 +86,7 @@ def _additions(own: SimulatedTruckConfig, folder: Path) -> Iterator[dict[str, An
 
 
 def free_port(wanted: int) -> int:
-    """The wanted port of the loopback interface if nothing listens there, else a free one."""
+    """Return the wanted port of the loopback interface if it is free, else another free port."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         with suppress(OSError):

@@ -64,7 +64,7 @@ class Account:
 
 
 def account_of(root: Path, who: str | int) -> Account | None:
-    """The user of that name or number in ``root/etc``; None if there is none."""
+    """Return the user of that name or number in ``root/etc``; None if it does not exist."""
     users = [line.split(":") for line in (text_of(root / "etc/passwd") or "").splitlines()]
     user = next((u for u in users if len(u) > 3 and who in (u[0], int(u[2]))), None)
     if user is None:
@@ -96,7 +96,7 @@ class Finding(Schema):
     reason: Reason = Reason.OK
     seen: str
     fix: str | None = None
-    """Command to type; None if nothing is to be fixed, or no command can."""
+    """Command that fixes it; None if there is no fault, or no such command."""
 
 
 def fine(check: str, seen: str, fix: str | None = None) -> Finding:
@@ -134,7 +134,7 @@ def first_failure(findings: list[Finding]) -> Reason:
 
 
 def version_of(package: str) -> str | None:
-    """Version of an installed distribution; None if there is none."""
+    """Return the version of an installed distribution; None if it is not installed."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
@@ -176,7 +176,7 @@ class HostContext:
         return (self.at(STATE) if self.at(UNIT).is_file() else Path()) / directory
 
     def node(self, port: AnyPort, *, camera: bool = False) -> Path | None:
-        """Device node of a port; None if nothing usable is plugged in, and of a network socket."""
+        """Return the device node of a port; None for an empty port and for a network socket."""
         if isinstance(port, TcpPortConfig | CommandPortConfig):
             return None
         if not isinstance(port, UsbPortConfig):
@@ -201,7 +201,7 @@ class HostContext:
         return self.command("find-port", role, "--write", str(self.config_file))
 
     def daemon(self) -> int | None:
-        """Process of a running daemon; None if there is none."""
+        """Return the process of a running daemon; None if none runs."""
         return next((pid for pid, words in self._processes() if _runs_daemon(words)), None)
 
     def runs(self, name: str) -> bool:

@@ -128,7 +128,7 @@ def _settings(role: str, port: UsbPortConfig, device: UsbDevice, node: Node) -> 
 
 
 async def handshakes(context: HostContext) -> AsyncIterator[Finding]:
-    """One finding per device that is plugged in; all are asked at once."""
+    """Return one finding per connected device; all are queried in parallel."""
     if context.config is None:
         return
     daemon = context.daemon()
@@ -146,7 +146,7 @@ async def handshakes(context: HostContext) -> AsyncIterator[Finding]:
 
 
 def _reached(context: HostContext, device: Device[Schema]) -> str | None:
-    """Where a device is asked: its node, or its address; None if it is not plugged in."""
+    """Return the device's node or address; None if it is not connected."""
     if isinstance(device.port, TcpPortConfig | CommandPortConfig):
         return device.port.label
     node = context.node(device.port, camera=device.kind.opens == "video")

@@ -1,8 +1,8 @@
 """Drives of 20 cm there and back, to both sides, where allowed: sensors, motor and steering with a wrong sign show.
 
-Motor and steering say how far the robot goes and turns; the lidar's scans, compass and IMU each say it by themselves.
-One of them that disagrees with the motor and the others has the wrong sign; where all disagree, it is the motor's or
-the steering's own.
+Motor and steering give distance and turn of the robot; the lidar's scans, compass and IMU each measure them
+independently. A single sensor that disagrees with the motor and the others has the wrong sign; if all disagree, the
+sign of the motor or the steering is wrong.
 """
 
 import math
@@ -103,7 +103,7 @@ def movement(record: MoveRecord, chassis: TruckChassis, lidar: Array | None) -> 
 
 
 def by_wheels(record: MoveRecord, chassis: TruckChassis) -> tuple[float, float]:
-    """Distance, m, and turn, rad, by motor and steering."""
+    """Distance (m) and turn (rad) by motor and steering."""
     motor, front, rear = record.steps()
     distance = turn = 0.0
     for step, servos in zip(motor.tolist(), zip(front.tolist(), rear.tolist(), strict=True), strict=True):
@@ -186,7 +186,7 @@ def judged(moves: list[Movement], command: Callable[..., str]) -> Iterator[Findi
 
 
 def shares_of_turn(moves: Sequence[Movement]) -> dict[str, float]:
-    """What each sensor saw of the turn by motor and steering: 1 = all of it, below 0 = against it.
+    """Return each sensor's share of the turn by motor and steering: 1 for all of it, negative for the opposite way.
 
     Wheels that are off centre turn the robot by so much a metre, to whichever side they are steered: that is left out.
     """

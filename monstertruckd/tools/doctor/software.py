@@ -19,7 +19,7 @@ MACHINES = ("x86_64", "aarch64")
 OURS = ("bench", "dev", "docs")
 """Extras for work on the project itself: dozens of packages that no robot and no station lacks."""
 NEEDED = "robot"
-"""Extra without which no device can be used."""
+"""Extra that every device requires."""
 
 
 def python(context: HostContext, machine: str = platform.machine()) -> Iterator[Finding]:
@@ -241,7 +241,7 @@ def _stale(context: HostContext) -> list[Path]:
 
 
 async def _state(context: HostContext) -> dict[str, str]:
-    """State of the service by systemd; empty where there is no systemd."""
+    """Return the state of the service according to systemd; empty without systemd."""
     try:
         code, said = await context.computer.machine.run(["systemctl", "show", "-p", "ActiveState,NRestarts", SERVICE])
     except OSError:
