@@ -27,69 +27,69 @@ class LocalPlannerState:
     """State of a local planner between two cycles."""
 
     route: PosePath | None = None
-    """The route of the last cycle; another one resets the state."""
+    """Route of the last cycle; a different route resets the state."""
     band: PosePath | None = None
-    """The band of the last cycle."""
+    """Band of the last cycle."""
     entered: int = 0
-    """Poses of the route that are in the band or behind the truck."""
+    """Number of route poses in the band or behind the truck."""
     path: MotionPath | None = None
-    """The result of the last cycle."""
+    """Result of the last cycle."""
     failed: int = 0
-    """Local searches in sequence without a result; after some another heading is tried at the goal."""
+    """Number of successive local searches without a result; after some, another heading is tried at the goal."""
     turning: tuple[float, ...] = ()
-    """Emergency turn: start x, y, yaw and wanted yaw."""
+    """Emergency turn: initial x, y, yaw, and wanted yaw."""
 
     @property
     def final(self) -> bool:
-        """Whether the band ends where the route does."""
+        """Whether the band ends at the end of the route."""
         return self.route is not None and self.entered == len(self.route.poses)
 
 
 @dataclass(frozen=True)
 class LocalPlan:
-    """A drivable path around the obstacles, or the reason why there is none."""
+    """Drivable path around the obstacles, or the reason for its absence."""
 
     reason: Reason
     """OK; PATH_PARTIAL: ``path`` is the free part; otherwise there is no path."""
     state: LocalPlannerState
-    """For the next cycle."""
+    """State for the next cycle."""
     path: MotionPath | None = None
-    """From the truck to the end of the route or before."""
+    """Path from the truck to the end of the route or to an earlier pose."""
     complete: bool = False
     """Whether the path ends at the end of the route."""
     text: str = ""
-    """Detail of the reason."""
+    """Details of the reason."""
     statistics: dict[str, float] = field(default_factory=dict)
 
 
 class LocalPlanner(Protocol):
-    """Pure: equal arguments give equal results."""
+    """Local planner; equal arguments give equal results."""
 
     vehicle: Vehicle
 
     def plan(self, route: PosePath, obstacles: DistanceField, pose: ArrayLike, state: LocalPlannerState) -> LocalPlan:
-        """Drivable path along a route, around the obstacles on it.
+        """Plan a drivable path along a route, around the obstacles on it.
 
         Args:
             route: poses of the reference point.
-            obstacles: in a window around the truck.
+            obstacles: obstacles in a window around the truck.
             pose: x, y, yaw of the reference point, in the frame of both.
             state: state of the cycle before, ``LocalPlannerState()`` at first.
 
         Raises:
-            InputError: a pose that is none.
+            InputError: the pose is not finite or has a wrong shape.
         """
 
 
 def pose_distance(a: Array, b: Array, reach: float = 0.3) -> Array:
-    """Distance of poses (..., 3): metres plus ``reach`` times the angle between them."""
+    """Return the distance of poses (..., 3): metres plus ``reach`` times the angle between them."""
     away: Array = np.hypot(a[..., 0] - b[..., 0], a[..., 1] - b[..., 1])
     turned = np.abs(np.remainder(a[..., 2] - b[..., 2] + math.pi, math.tau) - math.pi)
     return np.asarray(away + reach * turned)
 
 
 def nearest_pose(band: PosePath, pose: Array) -> int:
-    """Index of the band's pose nearest to the truck, not beyond a cusp that the truck has not reached."""
+    """Return the band's pose nearest to the truck, not beyond a cusp that the truck has not reached."""
     for begin, end in direction_runs(band.directions):
         at = begin + int(np.argmin(pose_distance(band.poses[begin:end], pose)))
         last = band.poses[end - 1]

@@ -1,4 +1,4 @@
-"""The local planners, which deform a route, by ``kind``; they run in workers."""
+"""Local planners, which deform a route, by ``kind``; they run in workers."""
 
 from typing import TYPE_CHECKING, Annotated, Final, cast
 
@@ -34,16 +34,16 @@ LOCAL_PLANNERS: Final = Catalog(
     ),
     base=LocalPlannerConfig,
 )
-"""A local planner is made from the vehicle and its settings; it is a ``LocalPlanner``."""
+"""A local planner kind is built from the vehicle and its settings, and is a ``LocalPlanner``."""
 
 AnyLocalPlanner = Annotated[LocalPlannerConfig, LOCAL_PLANNERS.section()]
-"""The configuration's section `planner.local_planner`."""
+"""Section `planner.local_planner` of the configuration."""
 
 
 def make_local_planner(vehicle: "Vehicle", config: LocalPlannerConfig) -> "LocalPlanner":
-    """Local planner of a configuration.
+    """Build the local planner of a configuration.
 
     Raises:
-        InputError: settings without a kind of local planner, or what it needs is not installed.
+        InputError: the settings name no kind of local planner, or a required package is not installed.
     """
     return cast("LocalPlanner", LOCAL_PLANNERS.build(config, vehicle, config))

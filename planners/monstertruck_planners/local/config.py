@@ -15,19 +15,19 @@ class BandConfig(Schema):
     """Elastic band."""
 
     overlap: Annotated[float, Field(gt=0, le=1)] = 0.7
-    """Neighbouring bubbles touch if they are nearer than this share of the sum of their radii."""
+    """Maximum distance of touching bubbles, as a share of the sum of their radii."""
     internal_gain: NotNegative = 1.0
-    """Gain of the attraction of both neighbours."""
+    """Gain of the attraction by both neighbours."""
     external_gain: NotNegative = 2.0
-    """Gain of the repulsion of obstacles."""
+    """Gain of the repulsion by obstacles."""
     iterations: Count = 5
-    """Sweeps over the band and back."""
+    """Number of sweeps over the band and back."""
     depth: Count = 5
-    """Times an overshooting step, or a gap, is halved."""
+    """Number of times that an overshooting step, or a gap, is halved."""
     overshoot: Positive = 0.75
-    """A reversed force is an overshoot if it is greater than this share of the previous one."""
+    """Minimum share of the previous force above which a reversed force is an overshoot."""
     significant: Positive = 0.1
-    """Smaller forces are never an overshoot."""
+    """Minimum force of an overshoot."""
     tiny: Positive = 0.01
     """Bubbles up to this radius are in collision (m)."""
     largest: Positive = 0.4
@@ -35,22 +35,22 @@ class BandConfig(Schema):
 
 
 class PeopleConfig(Schema):
-    """People who walk near the robot."""
+    """Walking people near the robot."""
 
     speed: Positive = 0.25
-    """Minimum speed of a walking person (m/s); slower things are obstacles where they stand."""
+    """Minimum speed of a walking person (m/s); slower objects are obstacles at their current places."""
     horizon: Annotated[float, Field(gt=0, le=5)] = 2.0
     """Time over which people are predicted along their motion (s)"""
     distance: NotNegative = 0.2
-    """Distance kept from their predicted places (m)."""
+    """Distance from their predicted places (m)."""
     spread: NotNegative = 0.1
-    """Growth of that distance with the time predicted (m/s)."""
+    """Growth of that distance with the prediction time (m/s)."""
     patience: Positive = 8.0
-    """Maximum wait for people to pass (s); then the robot continues, and treats them as obstacles where they are."""
+    """Maximum wait for people to pass (s); then the robot continues, and treats them as static obstacles."""
 
 
 class LocalPlannerConfig(Schema):
-    """Shared by all local planners."""
+    """Settings shared by all local planners."""
 
     band: BandConfig = BandConfig()
     margin: NotNegative = 0.02
@@ -60,7 +60,7 @@ class LocalPlannerConfig(Schema):
     inset: NotNegative = 0.1
     """Distance between the window's border and the circle around the footprint where the route is cut (m)."""
     effort: Count = 1100
-    """Nodes expanded and smoothing trials of a local search: bounds the time of a cycle."""
+    """Number of expanded nodes and smoothing trials of a local search, which bounds the time of a cycle."""
     reverse_cost: Annotated[float, Field(ge=1)] = 3.0
     """Cost of a metre backward, where the lidar does not look (m)."""
     cusp_cost: NotNegative = 0.3
@@ -78,13 +78,13 @@ class RsbandConfig(LocalPlannerConfig):
 
     kind: Literal["rsband"] = "rsband"
     strategy: Strategy = "start_to_next"
-    """How the path joins the poses of the band."""
+    """Method that joins the poses of the band to a path."""
     sub_goal: Positive = 0.6
     """Length of band to the goal of ``start_to_next`` (m)."""
     spacing: Positive = 0.4
     """Distance between the band poses that are joined one by one (m)."""
     renew: Positive = 0.5
-    """A path is replaced when less than this share of its length is left."""
+    """Share of a path's length below which the remaining path is replaced."""
     off_path: Positive = 0.1
     """A path is replaced when the truck is further away from it (m)."""
 
@@ -94,7 +94,7 @@ class PublishedConfig(LocalPlannerConfig):
 
     kind: Literal["rsband-as-published"] = "rsband-as-published"
     strategy: Strategy = "start_to_next"
-    """How the path joins the poses of the band."""
+    """Method that joins the poses of the band to a path."""
     sub_goal: Positive = 0.6
     """Length of band to the goal of ``start_to_next`` (m)."""
     radius: Positive = 1.0
@@ -102,7 +102,7 @@ class PublishedConfig(LocalPlannerConfig):
     inflation: Positive = 0.3
     """Radius of the inflation; states must lie outside of it (m)."""
     emergency: bool = True
-    """Turn by 45 degrees and more when nothing else is found."""
+    """Turn by 45 degrees and more if no path is found."""
 
 
 class TebConfig(LocalPlannerConfig):
@@ -112,7 +112,7 @@ class TebConfig(LocalPlannerConfig):
     spacing: Positive = 0.1
     """Distance between the poses (m)."""
     iterations: Count = 8
-    """Gauss-Newton steps in one cycle."""
+    """Number of Gauss-Newton steps per cycle."""
     clearance: Positive = 0.1
     """Preferred between footprint and obstacles (m)."""
     obstacle_weight: Positive = 30.0

@@ -41,12 +41,12 @@ PATH_CUSP_REACHED = 0.02
 def escape_motion(
     field: FieldData, footprint: FootprintData, cover: CoveringDiscs, pose: Array, primitives: Array, margin: float
 ) -> Array:
-    """Shortest motion to a pose that keeps the margin, without any part of the truck coming nearer to an obstacle.
+    """Return the shortest motion to a pose that keeps the margin, with no part of the truck nearing an obstacle.
 
     Args:
-        field: obstacles.
-        footprint: for the margin.
-        cover: the same, for clearances, see ``cover_footprint``.
+        field: distance field of the obstacles.
+        footprint: footprint for the margin.
+        cover: discs of the footprint for clearances, see ``cover_footprint``.
         pose: shape (3,), of the truck, nearer to something than the margin.
         primitives: shape (n, 3): segments whose signs, curvatures and sideslips may be driven. Of equally long motions
             the first one is taken.
@@ -81,18 +81,18 @@ def escape_motion(
 
 @dataclass(frozen=True)
 class CycleStart:
-    """Beginning of a cycle."""
+    """Start of a cycle."""
 
     robot_pose: Array
     """Shape (3,): the truck's pose."""
     band: PosePath
-    """The route in the window, from near the truck to the last free pose."""
+    """Route in the window, from near the truck to the last free pose."""
     state: LocalPlannerState
     """Return the state with the new band."""
 
 
 class LocalPlannerCore:
-    """Route in the window, collision checks and local search of one vehicle.
+    """Window, collision checks and local search of one vehicle.
 
     Args:
         vehicle: steered vehicle.
@@ -116,7 +116,7 @@ class LocalPlannerCore:
         """Cut the route to the window for one cycle, see ``LocalPlanner``; the result, if nothing of it is free.
 
         Raises:
-            InputError: a pose that is none.
+            InputError: the pose is not finite or has a wrong shape.
         """
         robot_pose = checked_pose(pose)
         if state.route is not route:
@@ -153,7 +153,7 @@ class LocalPlannerCore:
         return near, entered
 
     def _entered(self, ahead: PosePath, near: PosePath | None, obstacles: DistanceField, pose: Array) -> int:
-        """Number of route poses that join the band: up to the last free one that is in the window and in reach."""
+        """Return the number of route poses that join the band: up to the last free one within the window and reach."""
         begin = 0.0 if near is None else near.travelled[-1]
         inside = self._in_window(ahead.poses, obstacles, self.config.inset)
         inside &= begin + ahead.travelled <= self.config.reach
@@ -170,11 +170,11 @@ class LocalPlannerCore:
         return np.asarray(((places > inset) & (places < size - inset)).all(axis=1))
 
     def free(self, obstacles: DistanceField, path: MotionPath) -> bool:
-        """Whether a path keeps the margin all the way."""
+        """Whether a path keeps the margin throughout."""
         return self._planners[0].free(RouteMap(obstacles), path)
 
     def free_length(self, obstacles: DistanceField, path: MotionPath) -> float:
-        """Metres of a path before the first pose that does not keep the margin."""
+        """Return the length of a path before the first pose without the margin (m)."""
         samples = path.sample(0.02)
         free = obstacles.free(self.vehicle.footprint, samples.poses, self.config.margin)
         if free.all():
@@ -190,11 +190,11 @@ class LocalPlannerCore:
         search, and the truck may have backed off so far that its end is out of the window.
 
         Args:
-            obstacles: in the window.
+            obstacles: obstacles in the window.
             pose: pose of the truck.
-            band: the route in the window.
-            failed: searches in sequence without a result.
-            final: whether the band ends with the route; where it does not, other headings are accepted.
+            band: route in the window.
+            failed: number of successive searches without a result.
+            final: whether the band ends with the route; otherwise other headings are accepted.
 
         Returns:
             The path and the band that follows from it, or the reason why there are none.
@@ -206,7 +206,7 @@ class LocalPlannerCore:
         # headings tried at the goal of a local search, relative to the route, rad
         goal_headings = (0.0, 1.0, -1.0)
         if last < len(band.poses) - 1 or not final:
-            # 5: searches without a result before another heading is tried
+            # 5: number of searches without a result before another heading is tried
             goal[2] += goal_headings[failed // 5 % len(goal_headings)]
         path, reason = self._search_to(obstacles, pose, goal)
         if path is None:
@@ -276,7 +276,7 @@ class LocalPlannerCore:
 
 
 def checked_pose(pose: ArrayLike) -> Array:
-    """A pose (x, y, yaw).
+    """Return a valid pose (x, y, yaw).
 
     Raises:
         InputError: it is none.
@@ -288,7 +288,7 @@ def checked_pose(pose: ArrayLike) -> Array:
 
 
 def costs_of(config: LocalPlannerConfig) -> HybridConfig:
-    """Costs of local searches and motions."""
+    """Return the costs of local searches and motions."""
     names = ("reverse_cost", "cusp_cost", "crab_cost", "clearance_cost", "effort")
     return HybridConfig(**{name: getattr(config, name) for name in names})
 
@@ -346,7 +346,7 @@ def starting_at(band: PosePath, robot_pose: Array) -> PosePath:
 
 
 def ends_at(path: MotionPath, goal: Array) -> bool:
-    """Whether a path leads to a pose, within 5 cm and 0.09 rad."""
+    """Whether a path ends at a pose, within 5 cm and 0.09 rad."""
     away = path.end - goal
     turned = abs(float(np.remainder(away[2] + np.pi, 2 * np.pi) - np.pi))
     return float(np.hypot(away[0], away[1])) < 0.05 and turned < 0.09

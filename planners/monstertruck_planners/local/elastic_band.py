@@ -23,11 +23,11 @@ from monstertruck_planners.pose_path import PosePath
 BoolArray = NDArray[np.bool_]
 
 MAX_BUBBLES = 400
-"""Bubbles in a band."""
+"""Maximum number of bubbles in a band."""
 
 
 class CoveringDiscs(NamedTuple):
-    """Discs that together cover a footprint tightly."""
+    """Discs that tightly cover a footprint."""
 
     x: Array
     y: Array
@@ -50,13 +50,13 @@ class BandParameters(NamedTuple):
     significant: float
     tiny: float
     largest: float
-    """Largest radius (m)."""
+    """Maximum radius (m)."""
     scale: float
     """Ratio of a bubble's radius to its clearance: 1; 0.5 in the published planner."""
     reach: float
     """Metres per radian between two headings; 0 in the published planner."""
     spacing: float
-    """Largest distance of neighbours (m)."""
+    """Maximum distance of neighbours (m)."""
     published: bool
     """Steps of a whole radius, and a previous force that counts its x twice and its y never."""
 
@@ -132,7 +132,7 @@ def _refine(
     """Fill gaps between bubbles and remove redundant ones.
 
     Args:
-        field: obstacles.
+        field: distance field of the obstacles.
         cover: footprint.
         parameters: parameters of the band.
         band: shape (MAX_BUBBLES, 6): x, y, yaw, radius, direction, sideslip; changed in place.
@@ -261,7 +261,7 @@ def update_radii(field: FieldData, cover: CoveringDiscs, parameters: BandParamet
     """Compute all radii.
 
     Returns:
-        Index of the first bubble that is too small, or ``count``.
+        Return the index of the first bubble that is too small, or ``count``.
     """
     broken = count
     for i in range(count - 1, -1, -1):
@@ -302,7 +302,7 @@ class BandResult:
     path: PosePath | None
     """None: it is broken."""
     broken: int
-    """Bubbles before the first one that touches something; their number if none does."""
+    """Number of bubbles before the first one in contact; their total number without contact."""
     radii: Array
     """Shape (n,) (m); of the path's poses."""
 
@@ -384,7 +384,7 @@ def _cusps(path: PosePath) -> NDArray[np.int64]:
 
 
 def _sideslips(path: PosePath) -> Array:
-    """Return the angle from heading to course, rad, for every pose; small angles are corners of the path, not crab."""
+    """Return the angle from heading to course of every pose (rad); small angles are corners of the path, not crab."""
     steps = np.diff(path.poses[:, :2], axis=0)
     if not len(steps):
         return np.zeros(len(path.poses))

@@ -1,7 +1,7 @@
-"""People who walk near the robot: found in scans, followed, and predicted along their motion (pure).
+"""Walking people near the robot: detected in scans, tracked, and predicted along their motion (pure).
 
-A group of neighbouring returns, as narrow as a person and hidden by nothing in front of it, is followed from scan to
-scan. It counts as a walker once it moves. Everything else stays an obstacle where it stands.
+A group of neighbouring returns that is as narrow as a person and not hidden by an object in front is tracked from scan
+to scan. Once it moves, it is a walker. All other returns are static obstacles.
 """
 
 import math
@@ -27,7 +27,7 @@ MEMORY: Final = 0.8
 
 @dataclass(frozen=True, slots=True)
 class Walker:
-    """A person who walks, as a disc."""
+    """A walking person, as a disc."""
 
     place: tuple[float, float]
     """Centre (m)."""
@@ -73,7 +73,7 @@ class _PersonTrack:
 
 
 class PeopleTracker:
-    """Follows the people around the robot.
+    """Track the people around the robot.
 
     Args:
         config: criteria for a walker.
@@ -86,7 +86,7 @@ class PeopleTracker:
     def observe(
         self, stamp: int, points: Array, mapped: NDArray[np.bool_], sensor: Array
     ) -> tuple[tuple[Walker, ...], NDArray[np.bool_]]:
-        """Take a scan.
+        """Add a scan.
 
         Args:
             stamp: stamp of the scan (ns).
@@ -117,7 +117,7 @@ class PeopleTracker:
             if math.hypot(*velocity) >= self._config.speed:
                 walkers.append(Walker((x, y), velocity, track.radius))
                 walking[group] = True
-        # A person who is hidden for a moment is still there.
+        # A person hidden for a moment keeps the track.
         self._tracks += [track for track in known if stamp - track.rows[-1][0] < MEMORY / 2 * SECOND]
         return tuple(walkers), walking
 
@@ -128,7 +128,7 @@ def _groups(points: Array, mapped: NDArray[np.bool_], sensor: Array) -> Iterator
     cuts = np.flatnonzero(np.hypot(*np.diff(points[new], axis=0).T) > LEGS_APART) + 1
     ranges = np.hypot(*(points - sensor).T)
     for group in np.split(new, cuts):
-        # 0.8: greatest width of a person with a load, m
+        # 0.8: maximum width of a person with a load, m
         if len(group) < 2 or math.dist(*points[group[[0, -1]]]) > 0.8:
             continue
         first, last = int(group[0]), int(group[-1])
@@ -152,7 +152,7 @@ def meets(
     A robot that stands, or that moves away from a person, does not approach.
 
     Args:
-        walkers: people.
+        walkers: walking people.
         poses: planned poses of base at the times, from now on, shape (n, 3).
         times: from now (s), shape (n,).
         footprint: outline.

@@ -31,7 +31,7 @@ from monstertruck_schemas.reasons import Reason
 
 
 class RsbandPlanner:
-    """The local planner of kind ``rsband``.
+    """Local planner of kind ``rsband``.
 
     Args:
         vehicle: body and its limits.
@@ -108,7 +108,7 @@ class RsbandPlanner:
         return LocalPlan(Reason.OK, after, path, done, statistics=statistics)
 
     def _join(self, obstacles: DistanceField, robot_pose: Array, goal: Array) -> MotionPath | None:
-        """Best motion between two poses if it is free."""
+        """Return the best motion between two poses if it is free."""
         path = self._reeds_shepp.path(robot_pose, goal)
         return path if len(path.segments) and self._core.free(obstacles, path) else None
 

@@ -40,13 +40,13 @@ from monstertruck_planners.route.motion import MotionPath
 from monstertruck_schemas.reasons import Reason
 
 WIDTH = 12
-"""Unknowns that a residual may touch, and diagonals of the matrix."""
+"""Number of unknowns per residual, and of diagonals of the matrix."""
 
 LEAST_STEP = 0.01
 """Minimum distance in an interval (m)."""
 
 LEAST_TIME = 0.02
-"""Shortest time of an interval (s)."""
+"""Minimum time of an interval (s)."""
 
 
 class TebParameters(NamedTuple):
@@ -54,10 +54,10 @@ class TebParameters(NamedTuple):
 
     l_f: float
     l_r: float
-    """Distances of the axles before and behind the reference point (m)."""
+    """Distances of the axles ahead of and behind the reference point (m)."""
     front: float
     rear: float
-    """Maximum tangents of their angles."""
+    """Maximum tangents of the axle angles."""
     rate: float
     """Maximum rate of both tangents (1/s)."""
     speed: float
@@ -331,7 +331,7 @@ STEERING_SHARE = 0.9
 
 
 class TebPlanner:
-    """The local planner of kind ``teb``.
+    """Local planner of kind ``teb``.
 
     Args:
         vehicle: body, axles and limits of the robot.
@@ -376,7 +376,7 @@ class TebPlanner:
         return LocalPlan(Reason.OK, after, path, done, statistics=statistics)
 
     def _usable(self, rest: MotionPath, ahead: PosePath, obstacles: DistanceField) -> bool:
-        """Whether the last path may be kept: long enough, free, and not one that ends before the band does."""
+        """Whether the last path may be kept: it is long enough, free, and does not end before the band."""
         long = rest.length > self.config.shortest
         near = long and math.hypot(*(rest.end - ahead.poses[-1])[:2]) < self.config.reach / 3
         return near and self._core.free(obstacles, rest)
@@ -495,7 +495,7 @@ def resampled(path: PosePath, spacing: float) -> PosePath:
 
 
 def _steering_modes(vehicle: Vehicle, segments: Array) -> tuple[str, ...]:
-    """How each segment is steered."""
+    """Return the steering mode of each segment."""
     return tuple(
         vehicle.steering if slip == 0.0 else "hybrid" if curvature else "crab"
         for _, curvature, slip in segments.tolist()
