@@ -30,7 +30,7 @@ MEASURED = re.compile(r"#+ (Measured\b|Benchmarks$|Safety case$|.*, measured$)",
 BENCHMARK = re.compile(r"\bbenchmarks[/.]\w")
 """What a paragraph names that shows results."""
 EXEMPT_COLUMNS = re.compile(r"goals?|condition|judged by")
-"""Headings of columns that hold what is required, not what was measured."""
+"""Headings of columns with requirements rather than measurements."""
 
 
 @dataclass(frozen=True, slots=True)
