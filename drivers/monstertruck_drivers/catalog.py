@@ -572,7 +572,7 @@ DEVICES: Final = DeviceCatalog(
     ),
     DeviceKind(
         name="mjpeg",
-        doc="Camera with motion JPEG from a program's output or over the network",
+        doc="Motion JPEG camera, read from a program's output or over the network",
         roles=(CAMERA,),
         settings="monstertruck_drivers.mjpeg.config:MjpegConfig",
         implementation="monstertruck_drivers.mjpeg.driver:MjpegDriver",

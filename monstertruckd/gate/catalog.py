@@ -47,7 +47,7 @@ class FreshConfig(CheckConfig):
         if self.topic not in BY_NAME or self.row.inward:
             raise ValueError(f"topic {self.topic!r}: expected a topic of the robot")
         if self.within is None and self.row.stale_after is None:
-            raise ValueError(f"topic {self.topic}: has no staleness limit: set within")
+            raise ValueError(f"topic {self.topic}: has no staleness limit; set `within`")
         return self
 
 

@@ -144,7 +144,7 @@ class Reason(StrEnum):
     )
     HEADING_DISTURBED = "heading_disturbed", 95, "the compass is disturbed: its headings are left out"
     IMU_DISAGREES = "imu_disagrees", 99, "the IMU and the wheels measure different turns"
-    SENSORS_DISAGREE = "sensors_disagree", 125, "two sensors measure contradictory motions"
+    SENSORS_DISAGREE = "sensors_disagree", 125, "two sensors report conflicting motion"
     SENSOR_FROZEN = "sensor_frozen", 108, "a sensor repeats identical values"
     UNWITNESSED = "unwitnessed", 109, "no second sensor measures the robot's motion: speed limited"
     SENSORS_AGREE = "sensors_agree", 0, "the sensors agree again"

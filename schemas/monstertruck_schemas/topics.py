@@ -371,7 +371,7 @@ STAND_POSE: Final = Topic(
     "stand/pose",
     StandPose,
     W.STAND,
-    "Pose of the robot as a test stand sees it; recorded with the robot's topics, read by its consistency check alone",
+    "Pose of the robot as a test stand sees it; recorded with the robot's topics, used only by its consistency check",
     20,
     place="stand/sensor/pose_{robot}",
 )

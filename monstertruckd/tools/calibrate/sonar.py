@@ -205,7 +205,7 @@ def result_of(legs: Sequence[SonarLeg], settings: Srf08Config, wall: float, tape
         unobserved=(
             "height and tilt of the cones",
             "decrease of the sensitivity towards the edge of a cone: a hard edge is assumed",
-            "the speed of sound at another temperature: 0.6 m/s for each degree Celsius",
+            "how the speed of sound changes with temperature: by 0.6 m/s per degree Celsius",
         ),
     )
 

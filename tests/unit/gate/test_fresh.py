@@ -53,7 +53,7 @@ def test_a_truck_whose_topic_was_never_heard_is_not_armed():
     [
         ("sensor/imuu", "expected a topic of the robot"),
         ("req/goal", "expected a topic of the robot"),
-        ("event/event", "has no staleness limit: set within"),
+        ("event/event", "has no staleness limit; set `within`"),
     ],
 )
 def test_a_topic_that_cannot_be_stale_is_refused(topic, text):
