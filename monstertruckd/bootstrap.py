@@ -242,7 +242,7 @@ def both(pytest: Path, wall: list[str], others: list[str]) -> int:
 
 
 def steps(*programs: tuple[Path, list[str]]) -> int:
-    """Run one check after the other; returns the exit code of the first that fails, or 0."""
+    """Run the checks in order; return the exit code of the first that fails, or 0."""
     for program, arguments in programs:
         code = retried(program, arguments, step(program, arguments))
         if code:

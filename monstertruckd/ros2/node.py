@@ -70,7 +70,7 @@ class RosNode(Protocol):
 def sole_publisher(
     found: Iterable[tuple[str, str, bytes]], namespace: str, own: Collection[str]
 ) -> tuple[RosSender | None, bytes]:
-    """Publisher of a topic and its identity; None unless exactly one belongs to another program.
+    """Return a topic's publisher and its identity if exactly one publisher belongs to another program, else None.
 
     Args:
         found: namespace, name of the node and identity of all publishers.

@@ -98,7 +98,7 @@ class TimedRamp:
         return self.shape.acceleration(t - self.begin)
 
     def over(self, t: float) -> bool:
-        """Whether it has come to its end."""
+        """Whether the profile has finished."""
         return t - self.begin >= self.shape.duration
 
 

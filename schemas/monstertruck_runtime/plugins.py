@@ -155,7 +155,7 @@ class Catalog(ExtensibleTable[P], Generic[P]):
         self._base, self._row_class = base, type(rows[0])
 
     def fault(self, row: Any) -> str | None:
-        """Error in a row of another distribution."""
+        """Error for an invalid plug-in entry of another distribution."""
         if not isinstance(row, self._row_class):
             return f"expected a {self._row_class.__name__}, found {type(row).__name__}"
         model: Any = row.settings_class()

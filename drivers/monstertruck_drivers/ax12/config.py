@@ -63,7 +63,7 @@ class AlarmConfig(Schema):
 
 
 class Ax12Config(Schema):
-    """Two Dynamixel AX-12A: pitch and roll of the lidar's mount."""
+    """Two Dynamixel AX-12A servos for pitch and roll of the lidar's mount."""
 
     kind: Literal["ax12"] = "ax12"
     pitch: JointConfig = JointConfig(id=1, zero=511, min_position=409, max_position=613)

@@ -135,7 +135,7 @@ class Exchanger:
         await self._answer(write_request(entry, value, self._node), entry, attempts, value)
 
     async def shorten_silence(self) -> None:
-        """Make the controller drop incomplete frames soon, if it supports that: a damaged byte then costs less time.
+        """Make the controller drop incomplete frames sooner, if supported, so that a corrupted byte costs less time.
 
         Raises:
             DeviceTimeoutError, ProtocolError, DeviceLostError: as ``read``.

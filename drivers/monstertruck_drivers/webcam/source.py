@@ -58,7 +58,7 @@ class FrameStream(Protocol):
         """The stream itself."""
 
     async def __aexit__(self, *_: object) -> None:
-        """Stop the camera and let it go."""
+        """Stop and release the camera."""
 
 
 class FrameSource(Protocol):

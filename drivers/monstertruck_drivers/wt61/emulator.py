@@ -69,7 +69,7 @@ class Wt61Emulator(FaultyDevice):
         self.faults["asleep"] = not self.faults["asleep"]
 
     def power_cycle(self) -> None:
-        """Supply off and on: it is awake again."""
+        """Cycle the power, which wakes the sensor up."""
         self.faults["asleep"] = False
         self.faults["half_packet"] = 1
         self._awake_at = self._clock.now() + 300_000_000  # nanoseconds from power-up to the first packet

@@ -47,7 +47,7 @@ class CameraPlace(NamedTuple):
 
 
 class FlatPanel(NamedTuple):
-    """A flat picture in the world, seen from its front."""
+    """Flat image in the world, visible only from the front."""
 
     texture: NDArray[np.uint8]
     """(rows, columns, 3)."""

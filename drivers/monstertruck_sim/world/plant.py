@@ -170,7 +170,7 @@ class Plant(ABC):
         """Move the robot to another pose, at rest; sensors see a jump, not a path between the two places."""
 
     def slot(self, time_ns: int, period_ns: int) -> int:
-        """Return the index of the period since the start that contains an instant; it indexes the noise."""
+        """Return the index, counted from the start, of the period that contains an instant; it selects the noise."""
         return max(0, time_ns - (self._start_ns or 0)) // period_ns
 
     def truth(self) -> TruthState:

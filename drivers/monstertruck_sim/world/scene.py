@@ -66,7 +66,7 @@ class Neighbour(Protocol):
         """Move on to an instant; the first call sets the start."""
 
     def outlines(self, times_ns: NDArray[np.int64]) -> list[Box]:
-        """Footprints at instants of the last half second."""
+        """Footprints of the moving bodies at sampled times in the last half second."""
 
 
 class Surroundings:

@@ -1,4 +1,4 @@
-"""The ground: its height, where beams meet it, and the tilt of a body on it; or a body that rocks with time."""
+"""Terrain: ground height, beam intersections and body tilt; or a body tilt that oscillates over time."""
 
 from dataclasses import dataclass
 from itertools import pairwise

@@ -132,7 +132,7 @@ class SteeringModel:
         self._linkage = chassis.linkage
 
     def axles(self, maps: Maps) -> LinkedAxles:
-        """The linkage with the deficit of ``maps``."""
+        """Return the linkage with the turn deficit of ``maps``."""
         return replace(self._linkage, deficit=maps.deficit)
 
     def axle_angle(self, axle: int, servo: float, maps: Maps) -> float:

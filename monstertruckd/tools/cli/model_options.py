@@ -134,7 +134,7 @@ def field_parameters(
 
 
 def _kind(name: str, annotation: Any) -> tuple[Any, dict[str, Any]]:
-    """Return the type of an option for a field, None aside, and the bounds of its whole numbers."""
+    """Return a field's option type, ignoring None, and its integer bounds."""
     if get_origin(annotation) is Annotated:
         kind, settings = _kind(name, get_args(annotation)[0])
         bounds = get_args(annotation)[1].metadata if kind is int else ()

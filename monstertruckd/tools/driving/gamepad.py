@@ -179,7 +179,7 @@ class Pad:
 
     @property
     def held(self) -> bool:
-        """Whether a hand holds the deadman button."""
+        """Whether the deadman button is being held."""
         return self._trusted and self._deadman
 
     def motion(self, mode: SteeringMode, speed: float, angle: float) -> TeleopRequest:

@@ -147,7 +147,7 @@ def _in_order(stamps: NDArray[np.int64], poses: Array) -> OdometryLog:
 
 
 def _limits(found: list[BagScan]) -> dict[str, float]:
-    """Minimum and maximum range by the first message; empty if it has none."""
+    """Minimum and maximum range from the first message; empty if it gives none."""
     limits = found[0].limits
     return {} if limits is None or not limits[0] < limits[1] else {"range_min": limits[0], "range_max": limits[1]}
 

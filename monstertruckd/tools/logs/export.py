@@ -262,7 +262,7 @@ def export_mcap(
 
 
 def in_unix_time(record: S, offset: int) -> S:
-    """The record with all its times shifted by ``offset`` ns; a clock offset becomes the remaining difference."""
+    """Return the record with all timestamps shifted by ``offset`` ns; a clock offset keeps only the difference."""
     changes: dict[str, Any] = {}
     for name in type(record).model_fields:
         value = getattr(record, name)

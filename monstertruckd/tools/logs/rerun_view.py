@@ -135,7 +135,7 @@ class Scene:
         }
 
     def truck(self, reader: LogReader) -> None:
-        """A box of the size in the log's configuration; logs without one show none."""
+        """The robot as a box sized by the log's configuration; omitted without a configuration."""
         with suppress(InputError, ConfigError):
             self.box(reader.config().get("geometry", {}))
 

@@ -85,7 +85,7 @@ def no_return(ranges: Array) -> float:
 
 
 def half_turn(stamp: int, ranges: Array, odom: Pose2 | None, geometry: dict[str, Any]) -> ScanInput:
-    """A scan of this ``geometry``; by default half a turn ahead: n beams, or n + 1 with both ends."""
+    """Return a scan of this ``geometry``; by default the forward 180 degrees in n beams, or n + 1 with both ends."""
     count = len(ranges)
     assumed = {
         "start_angle": -math.pi / 2,

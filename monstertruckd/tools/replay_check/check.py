@@ -116,7 +116,7 @@ def check_log(
 
 
 def _bunches(log: Iterable[LogMessage], ticks: Callable[[LogMessage], bool]) -> Iterator[list[LogMessage]]:
-    """Messages one by one; but outputs that show ticks together, as long as nothing else was recorded in between."""
+    """Yield messages one at a time, but group consecutive outputs that reveal ticks."""
     bunch: list[LogMessage] = []
     for entry in log:
         ticking = ticks(entry)

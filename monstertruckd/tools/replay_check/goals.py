@@ -171,7 +171,7 @@ def asks_standstill(entry: LogMessage) -> bool:
 
 
 def is_deformed(entry: LogMessage) -> bool:
-    """Whether a path came of deformation, not of a tick of the goal service."""
+    """Whether a path came from deformation rather than from a tick of the goal service."""
     path = entry.decode()
     return isinstance(path, Path) and re.fullmatch(DEFORMED, path.name) is not None
 

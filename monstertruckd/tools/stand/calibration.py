@@ -236,7 +236,7 @@ def load(path: Path) -> StandCalibration:
 
 
 def save(calibration: StandCalibration, path: Path) -> None:
-    """Write it, whole or not at all.
+    """Write the calibration file atomically.
 
     Raises:
         ConfigError: it cannot be written.

@@ -526,7 +526,7 @@ def find_offset(stamps: Array, matched: Array, odom: Array) -> float | None:
 
 
 def _turning(times: Array, wheel: Array, lag: float, inside: NDArray[np.bool_]) -> Array:
-    """Return the yaw rates of ``wheel`` between the ``times`` that are ``inside``, all shifted by ``lag`` (s)."""
+    """Return wheel yaw rates between consecutive ``times`` shifted by ``lag`` (s), where ``inside``."""
     return np.asarray((np.diff(np.interp(times + lag, times, wheel)) / np.diff(times))[inside])
 
 

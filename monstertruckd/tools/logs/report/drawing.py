@@ -43,7 +43,7 @@ class Axis:
 
 
 def value_axis(values: Iterable[float], span: float, *, zero: bool) -> Axis:
-    """Axis with round ends round all ``values``, at least ``span`` wide, with zero if wanted."""
+    """Axis with rounded limits enclosing all ``values``, at least ``span`` wide, optionally including zero."""
     shown = [*values, *([0.0] if zero else [])]
     low, high = min(shown), max(shown)
     if high - low < span:
