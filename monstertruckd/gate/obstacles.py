@@ -317,8 +317,9 @@ class ObstacleGuard:
                 self._stop_before(twist, before)
                 continue
             elif _is_ahead(twist):
+                in_front = ground[:, 0] > self._footprint.offset + self._footprint.half_length
                 tail = _near(ground * stretch, measured[near] * stretch, beside)
-                self._stop_before(twist, before[tail])
+                self._stop_before(twist, before[in_front | tail])
             self.known_slowly = float(before.min(initial=self.known_slowly))
 
     def _stop_before(self, twist: _Steps, before: Array) -> None:
@@ -330,7 +331,7 @@ class ObstacleGuard:
     def _unknown(self, twist: _Steps, ground: Array) -> NDArray[np.bool_]:
         """Whether each ground point (n, 2) along a motion is unseen by all scans, and not on the axis of a dock.
 
-        A motion ahead leads into the lidar's field of view, where sectors and points decide (``unseen``).
+        In a motion ahead, sectors and points decide about ground in a lidar's field of view (``unseen``).
         """
         unknown = ~self.looks_at(ground) if _is_ahead(twist) else np.ones(len(ground), np.bool_)
         unknown[unknown] = ~self.memory.seen(ground[unknown])
@@ -492,7 +493,7 @@ def _near(points: Array, others: Array, within: float) -> NDArray[np.bool_]:
 
 
 def _is_ahead(twist: _Steps) -> bool:
-    """Whether a motion leads into the lidar's field of view."""
+    """Whether a motion is mostly ahead."""
     return twist[0] * TWIST_STEP >= AHEAD
 
 

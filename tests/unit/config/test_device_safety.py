@@ -56,7 +56,7 @@ HARMLESS = {
         **dict.fromkeys(
             ("max_bad_scans", "stale_periods", "first_scan_periods", "line_timeout", "verify_timeout"), SEEN
         ),
-        "hidden": "outside the field of view: the gate takes this ground for unseen",
+        "hidden": "outside the field of view: the gate stops before this ground, ahead as in reverse",
         "clock_samples": "stamps later than gate.max_latency are not valid",
     },
     Os4000Config: {

@@ -349,3 +349,21 @@ def test_a_sector_behind_a_mast_is_outside_the_field_of_view():
     assert {0, 1}.isdisjoint(field)
     assert len(field) == SECTORS - 2
     assert all(field.values())
+
+
+@pytest.mark.parametrize("hidden", [(0.0, 120.0), (-119.0, 0.0), (-30.0, 30.0), (-9.0, 9.0)])
+def test_before_ground_ahead_that_the_lidar_cannot_see_it_stops(hidden):
+    rig = Rig()
+    rig.unknown = ((*hidden, HIDDEN),)
+    rig.driving(speed=0.2, ticks=30)
+    assert rig.speed == 0.0
+    assert rig.out.reasons[0] is Reason.UNSEEN_STOP
+    rig.driver = {"speed": 0.2, "unseen": True}
+    rig.tick(40)
+    assert rig.speed == pytest.approx(0.05), "the operator holds the second control"
+
+
+def test_a_mast_beside_the_way_ahead_does_not_matter():
+    rig = Rig()
+    rig.unknown = ((100.0, 119.0, HIDDEN),)
+    assert rig.driving(speed=0.2, ticks=30).speed == pytest.approx(0.2)
