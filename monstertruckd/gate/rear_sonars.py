@@ -70,8 +70,8 @@ class RearSonars:
 
 
 def _ping(ranges: SonarRanges, echo: SonarEcho, mount: Place) -> MountedEcho:
-    half = ranges.field_of_view / 2
+    cone = ranges.field_of_view
     if echo.range is None:
-        return MountedEcho(echo.name, mount, Beams(echo.stamp, -half / 2, half, np.zeros(2)), np.empty((0, 2)))
+        return MountedEcho(echo.name, mount, Beams.across(echo.stamp, cone, 0.0), np.empty((0, 2)))
     free = echo.range if echo.range > ranges.range_min else 0.0  # nearer echoes are reported as about range_min
-    return MountedEcho(echo.name, mount, Beams(echo.stamp, -half / 2, half, np.full(2, free)), arc(mount, free, half))
+    return MountedEcho(echo.name, mount, Beams.across(echo.stamp, cone, free), arc(mount, free, cone / 2))

@@ -15,7 +15,7 @@ from monstertruck_kinematics.se2 import Pose2, Twist2, integrate, placed, points
 from monstertruck_planners.collision import Footprint, beyond, on_body, relative
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import position_deviation
-from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
+from monstertruck_schemas.sensor import HIDDEN, NO_ECHO, VALID_BEAM, LaserScan
 
 DRIFT: Final = 0.03
 """Ground this near to a place where the body stood counts as free, m: the error of dead reckoning. The distance shrinks
@@ -39,13 +39,31 @@ class Beams(NamedTuple):
     """Angle between adjacent beams, rad, negative clockwise."""
     free: Array
     """Free distance along every beam, shape (n,), m; 0 if unknown."""
+    hidden: NDArray[np.bool_]
+    """Whether parts of the robot hide each beam, shape (n,)."""
 
     @classmethod
     def of(cls, scan: LaserScan) -> Self:
         """Convert a scan."""
         known = (scan.codes == VALID_BEAM) | (scan.codes <= NO_ECHO)
         step = scan.angle_increment or math.tau
-        return cls(scan.stamp, scan.start_angle, step, np.where(known, scan.ranges, 0.0))
+        free = np.where(known, scan.ranges, 0.0)
+        return cls(scan.stamp, scan.start_angle, step, free, scan.codes == HIDDEN)
+
+    @classmethod
+    def across(cls, stamp: int, cone: float, free: float) -> Self:
+        """Free distance ``free`` (m) across the ``cone`` (rad) of a sonar, as of two beams."""
+        return cls(stamp, -cone / 4, cone / 2, np.full(2, free), np.zeros(2, np.bool_))
+
+    def inside(self, margin: float) -> NDArray[np.bool_]:
+        """Whether each beam lies further than ``margin`` (rad) from the edges of the field of view, shape (n,)."""
+        count, wide = len(self.hidden), math.ceil(margin / abs(self.step))
+        if is_full_turn(count, self.step):
+            outside = np.pad(self.hidden, wide, "wrap")
+        else:
+            outside = np.pad(self.hidden, wide, constant_values=True)
+        before = np.concatenate(([0], np.cumsum(outside)))
+        return np.asarray(before[2 * wide + 1 :] == before[:count])
 
 
 class _Taken(NamedTuple):
@@ -237,12 +255,11 @@ class ScanMemory:
         looked = np.zeros(len(there), np.bool_)
         for scan in self._latest():
             beams = _beams((scan,), there)[0][0]
-            count, step = len(scan.beams.free), scan.beams.step
             # Remembered points this near to the edge of the field of view are kept, rad: the error of the
             # dead-reckoned yaw.
             field_edge = 0.1
-            edge = 0.0 if is_full_turn(count, step) else field_edge / abs(step)
-            looked |= (beams >= edge) & (beams < count - edge)
+            inside = np.append(scan.beams.inside(field_edge), False)
+            looked |= inside[np.minimum(beams, len(inside) - 1)]
         points = points_relative(there[~looked], newest.pose)
         return points[~on_body(self._footprint, points, 0.0)]
 

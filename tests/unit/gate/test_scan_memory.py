@@ -12,7 +12,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order, Role
-from monstertruck_schemas.sensor import DriveMode
+from monstertruck_schemas.sensor import HIDDEN, DriveMode
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.config import GateConfig, InForce
 from monstertruckd.gate.obstacles import ObstacleGuard, at_poses
@@ -114,6 +114,23 @@ def test_points_at_the_edge_of_the_lidars_field_are_remembered(side, inside, kep
     there = np.array([(0.14 + 0.6 * math.cos(bearing), 0.6 * math.sin(bearing))])
     remembered.observe(scan(SECOND), there)
     remembered.observe(scan(SECOND), np.empty((0, 2)))
+    assert len(remembered.points()) == kept
+
+
+@pytest.mark.parametrize(("inside", "kept"), [(10.0, 1), (1.0, 1), (-2.0, 1), (-5.0, 1), (-6.5, 0), (-20.0, 0)])
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("middle", [0.0, 180.0])
+def test_points_behind_a_mast_are_remembered(middle, side, inside, kept):
+    """``inside`` are the degrees from the edge of a hidden sector of 60 degrees, of a lidar that looks all around."""
+    remembered = ScanMemory(FOOTPRINT, [(0.0, 0.0, 0.0)], 2.0, 30.0)
+    around = fan(SECOND, 720, increment=math.tau / 720, reach=2.0)
+    bearings = around.start_angle + around.angle_increment * np.arange(720)
+    hidden = np.cos(bearings - math.radians(middle)) > math.cos(math.radians(30.0))
+    masked = around.model_copy(update={"codes": np.where(hidden, np.uint8(HIDDEN), around.codes)})
+    bearing = math.radians(middle + side * (30.0 - inside))
+    remembered.observe(around, 0.6 * np.array([(math.cos(bearing), math.sin(bearing))]))
+    assert len(remembered.points()) == 0
+    remembered.observe(masked, np.empty((0, 2)))
     assert len(remembered.points()) == kept
 
 
@@ -429,6 +446,19 @@ def test_ahead_a_truck_that_has_seen_nothing_yet_may_steer_with_its_front_axle(f
 def test_ahead_the_tail_does_not_swing_against_what_the_lidar_has_left_behind(rear, free):
     post = (0.5, FOOTPRINT.half_width + 0.03)  # beside the tail at the end
     assert (passing(post).free_distance((ahead(0.0, rear),)) == math.inf) is free
+
+
+def test_a_lidar_that_looks_backwards_lets_it_drive_ahead_where_it_has_been():
+    guard, now = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, [ScanPoints((-0.14, 0.0, math.pi))]), SECOND
+    guard.observe(scan(now))
+    assert guard.free_distance((ahead(0.0, 0.0),)) == math.inf
+    assert guard.known < DRIFT
+    for _ in range(200):
+        now += TICK
+        guard.move(now, (-0.2, 0.0, 0.0), 0.02)
+    guard.observe(scan(now))
+    guard.free_distance((ahead(0.0, 0.0),))
+    assert guard.known == math.inf
 
 
 @pytest.mark.parametrize("angles", [(0.436, 0.0), (0.0, 0.2)])
