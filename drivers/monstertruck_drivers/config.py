@@ -3,6 +3,7 @@
 Both have a key for every role of the catalog, and accept the settings of every kind that fills the role.
 """
 
+import math
 import shlex
 from collections.abc import Iterator
 from functools import reduce
@@ -16,6 +17,7 @@ from pydantic import Discriminator, Field, Tag, create_model, field_validator, m
 from monstertruck_drivers.catalog import DEVICES, DeviceKind, Duty, RoleSpec
 from monstertruck_drivers.computer import Sysfs
 from monstertruck_drivers.link import BAUD, Framing
+from monstertruck_drivers.scanning.mounting import turned_by_roll
 from monstertruck_drivers.shafts import SteeringOutputs, steering_outputs
 from monstertruck_drivers.usb.config import Baud, UsbPortConfig
 from monstertruck_runtime.service import RestartPolicy
@@ -186,6 +188,17 @@ class _Devices(Schema):
         roles = [role for role, _ in self._steering()]
         if len(roles) > 1:
             raise ValueError(f"{roles[0]} and {roles[1]} both steer; remove the servos of one")
+        return self
+
+    @model_validator(mode="after")
+    def _lidars_turned_over_by_roll(self) -> Self:
+        for role, device in self.lidars().items():
+            if abs(pitch := device.mount.pitch) > math.pi / 2:
+                same = turned_by_roll(device.mount)
+                raise ValueError(
+                    f"{role}.mount.pitch {pitch:g}: expected -pi/2 to pi/2; the same orientation is "
+                    f"roll {same.roll:.4f}, pitch {same.pitch:.4f}, yaw {same.yaw:.4f}"
+                )
         return self
 
     @model_validator(mode="after")

@@ -23,6 +23,12 @@ def upright(mount: Mount) -> Mount:
     return mount.model_copy(update={"roll": math.remainder(mount.roll - math.pi, math.tau)}) if hangs(mount) else mount
 
 
+def turned_by_roll(mount: Mount) -> Mount:
+    """Return the same orientation with the roll, pitch and yaw of the other solution: roll and yaw half a turn on."""
+    half_turn = {name: math.remainder(getattr(mount, name) + math.pi, math.tau) for name in ("roll", "yaw")}
+    return mount.model_copy(update={**half_turn, "pitch": math.remainder(math.pi - mount.pitch, math.tau)})
+
+
 class MountedScans:
     """Publisher of the scans of a lidar as of an upright one, without what hidden beams measured.
 

@@ -62,6 +62,11 @@ WRONG = (
     ("devices: {lidar: {mount: {x: far}}}", "devices.lidar.mount.x: input should be a valid number, found 'far'"),
     ("devices: {lidar: {mount: {x: .inf}}}", "devices.lidar.mount.x: input should be a finite number, found inf"),
     (
+        "devices: {lidar: {mount: {pitch: 3.0, yaw: 0.5}}}",
+        "devices: lidar.mount.pitch 3: expected -pi/2 to pi/2; "
+        "the same orientation is roll 3.1416, pitch 0.1416, yaw -2.6416",
+    ),
+    (
         "devices: {drive: {driver: {node: 900}}}",
         "devices.drive.driver.node: input should be less than or equal to 127, found 900",
     ),

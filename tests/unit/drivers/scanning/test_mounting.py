@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_drivers.scanning.mounting import MountedScans, upright
+from monstertruck_drivers.scanning.mounting import MountedScans, turned_by_roll, upright
+from monstertruck_estimation.transforms import quaternion_from_rpy
 from monstertruck_schemas.body import Mount
 from monstertruck_schemas.sensor import HIDDEN, VALID_BEAM
 from tests.unit.gate.rig import scan
@@ -56,6 +57,15 @@ def test_its_mount_is_that_of_one_that_stands(roll, found):
     mount = Mount(x=0.1, yaw=1.0, roll=roll)
     assert upright(mount).roll == pytest.approx(found)
     assert upright(mount).planar == mount.planar
+
+
+@pytest.mark.parametrize("turn", [(0.0, math.pi, 0.0), (0.1, 3.0, -0.5), (-2.0, -1.7, 3.0)])
+def test_the_same_orientation_by_roll_instead_of_pitch(turn):
+    roll, pitch, yaw = turn
+    same = turned_by_roll(Mount(roll=roll, pitch=pitch, yaw=yaw))
+    assert abs(same.pitch) < math.pi / 2
+    rotations = quaternion_from_rpy(same.roll, same.pitch, same.yaw), quaternion_from_rpy(*turn)
+    assert abs(np.dot(*rotations)) == pytest.approx(1.0), "quaternions of one rotation"
 
 
 def degrees(message):
