@@ -311,11 +311,13 @@ class GridBuilder:
         self._returns: list[int] = []
         """Number of each scan's points that are echoes; the others end beams without an echo."""
         self._mounts: list[Pose2] = []
+        self._lidars: list[int] = []
+        """Number of each scan's lidar."""
 
     def __len__(self) -> int:
         return len(self._stamps)
 
-    def add(self, scan: Scan, stamp: int, pose: Array, mount: Pose2, passed: Array = NONE) -> bool:
+    def add(self, scan: Scan, stamp: int, pose: Array, mount: Pose2, passed: Array = NONE, lidar: int = 0) -> bool:
         """Integrate a scan if the robot has moved far enough since the last one of its lidar; return whether it did so.
 
         Args:
@@ -324,8 +326,9 @@ class GridBuilder:
             pose: base in map, shape (3,).
             mount: planar pose of the sensor in base.
             passed: ends in base of beams without an echo, shape (k, 2), see ``passed_ends``.
+            lidar: number of the lidar.
         """
-        if not len(scan) or not self._due(stamp, pose, mount):
+        if not len(scan) or not self._due(stamp, pose, lidar):
             return False
         longest_point = 32.7  # limit of points stored as 16-bit millimetres, m
         near, far = (ends[np.abs(ends).max(axis=1) < longest_point] for ends in (scan.points, passed))
@@ -334,6 +337,7 @@ class GridBuilder:
         self._points.append(np.round(np.vstack((near, far)) * MILLIMETRES).astype(np.int16))
         self._returns.append(len(near))
         self._mounts.append(mount)
+        self._lidars.append(lidar)
         self._draw(len(self._stamps) - 1)
         if len(self._stamps) > self._config.remembered:
             self._prune()
@@ -375,8 +379,8 @@ class GridBuilder:
         for i in range(len(self._stamps)):
             self._draw(i)
 
-    def _due(self, stamp: int, pose: Array, mount: Pose2) -> bool:
-        last = next((i for i in reversed(range(len(self))) if self._mounts[i] == mount), None)
+    def _due(self, stamp: int, pose: Array, lidar: int) -> bool:
+        last = next((i for i in reversed(range(len(self))) if self._lidars[i] == lidar), None)
         if last is None:
             return True
         config, off = self._config, between(self._poses[last], pose)
@@ -396,17 +400,18 @@ class GridBuilder:
 
     def _prune(self) -> None:
         """Drop every second scan of each lidar, except in the latest quarter."""
-        recent, counts = 3 * len(self) // 4, Counter[Pose2]()
+        recent, counts = 3 * len(self) // 4, Counter[int]()
         kept = []
-        for i, mount in enumerate(self._mounts):
-            if counts[mount] % 2 == 0 or i >= recent:
+        for i, lidar in enumerate(self._lidars):
+            if counts[lidar] % 2 == 0 or i >= recent:
                 kept.append(i)
-            counts[mount] += 1
+            counts[lidar] += 1
         self._keep(kept)
 
     def _keep(self, kept: list[int]) -> None:
         self._stamps = [self._stamps[i] for i in kept]
         self._poses = [self._poses[i] for i in kept]
         self._mounts = [self._mounts[i] for i in kept]
+        self._lidars = [self._lidars[i] for i in kept]
         self._returns = [self._returns[i] for i in kept]
         self._points.keep(kept)

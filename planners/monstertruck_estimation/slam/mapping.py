@@ -545,12 +545,12 @@ class MappingEstimator:
         )
 
     def draw(self, scan: Scan, inputs: ScanInput) -> None:
-        """Add a scan of another lidar to the grid, placed by odometry since the latest scan."""
+        """Add a scan of the second lidar to the grid, placed by odometry since the latest scan."""
         if self._drawn is not None and inputs.odom is not None:
             pose, odom = self._drawn
             there = compose(pose, between(np.array(odom), np.array(inputs.odom)))
             passed = NONE if self._passed is None else passed_ends(inputs, self._passed)
-            self.builder.add(scan, inputs.stamp, there, inputs.mount, passed)
+            self.builder.add(scan, inputs.stamp, there, inputs.mount, passed, lidar=1)
 
     def changes(self) -> tuple[list[GridPatch], bool]:
         """See ``Estimator``."""

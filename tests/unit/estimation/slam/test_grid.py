@@ -152,6 +152,20 @@ def test_scans_join_by_way_turn_or_time():
     assert builder.add(scan, 14 * 10**8, np.array((0.11, 0, 0.15)), level)
 
 
+def test_two_lidars_in_one_place_are_both_drawn_and_thinned_alike():
+    builder = GridBuilder(GridConfig(remembered=32))
+    left, right, place = scan_of((0.0, 1.0)), scan_of((0.0, -1.0)), (0.0, 0.0, 0.0)
+    for k in range(100):
+        pose = np.array((0.2 * k, 0.0, 0.0))
+        assert builder.add(left, 2 * k, pose, place)
+        assert builder.add(right, 2 * k + 1, pose, place, lidar=1)
+        assert not builder.add(right, 2 * k + 1, pose, place, lidar=1)
+    builder.keep_marked(np.arange(200), np.ones(200, np.bool_))
+    kept = [[k for k in range(100) if value(builder.grid, 0.2 * k, y) != -1] for y in (1.0, -1.0)]
+    assert kept[0] == kept[1]
+    assert 8 < len(kept[0]) <= 16
+
+
 def test_memory_is_bounded():
     builder = GridBuilder(GridConfig(remembered=32))
     for i in range(500):
