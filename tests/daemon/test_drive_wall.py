@@ -205,7 +205,7 @@ async def _orders(endpoint: str) -> None:
     assert silent.returncode == Reason.TIMEOUT.exit_code
     assert silent.stderr.splitlines() == [
         "robot 'truck' is running but does not publish sensor/drive_4 yet; waiting",
-        "no message of sensor/drive_4 within 3 s",
+        "no message of sensor/drive_4 received within 3 s",
     ]
 
 
