@@ -15,6 +15,8 @@ from monstertruck_estimation.slam.scans import Scan
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import compose, inverse, transform
 
+Marks = np.ndarray[tuple[int], np.dtype[np.bool_]]
+
 
 class Revolution(NamedTuple):
     """A scan and the sensor's position."""
@@ -30,11 +32,12 @@ class ScaleWatch:
 
     If the scale changes within a revolution, neither a motion nor a factor explains it; the next revolution is then
     compared with the one before the change. The last revolution before a change is kept: a change back may take longer
-    or happen while the lidar is covered. The ranges have changed back once they fit that revolution again.
+    or happen while the lidar is covered. The ranges have changed back once they fit that revolution, and fit it worse
+    when divided by the factor: the points of a single wall fit at any scale.
     """
 
     def __init__(self) -> None:
-        self._sound: tuple[Cloud, Array] | None = None
+        self._sound: tuple[Revolution, Array] | None = None
         """Last revolution before the scale changed, and the wheels' motion since; None while it is unchanged."""
         self._scale = 1.0
         """Factor from that revolution's ranges to the current ones."""
@@ -64,12 +67,12 @@ class ScaleWatch:
             return None
         if self._sound is None:
             assert earlier is not None
-            self._sound, self._scale = (Cloud.of(earlier.scan), np.zeros(3)), 1.0
-        cloud, moved = self._sound
+            self._sound, self._scale = (earlier, np.zeros(3)), 1.0
+        sound, moved = self._sound
         moved = compose(moved, motions[-1])
         # 0.5: maximum distance over which it sees the same surroundings, m
-        self._sound = None if math.hypot(moved[0], moved[1]) > 0.5 else (cloud, moved)
-        if np.count_nonzero(~_fits(latest.scan, cloud, moved)) < REFUTING:
+        self._sound = None if math.hypot(moved[0], moved[1]) > 0.5 else (sound, moved)
+        if _changed_back(latest, sound, moved, self._scale):
             self._sound = None
             return 1.0 / self._scale
         self._scale *= 1.0 if factor is None else factor
@@ -108,15 +111,30 @@ def scale_change(latest: Revolution, earlier: Revolution, motions: list[Array]) 
         return None
     rescaled = _rescaled(latest.scan, latest.origin, 1.0 / factor)
     scaled = max((_fits(rescaled, cloud, motion) for motion in motions), key=np.count_nonzero)
-    # Nothing else changes with the scale: every point that does not fit the rescaled revolution is evidence of motion,
-    # unless the earlier revolution did not reach so far.
+    return factor if _refuted(moved, scaled, latest._replace(scan=rescaled), earlier) else None
+
+
+def _changed_back(latest: Revolution, sound: Revolution, motion: Array, scale: float) -> bool:
+    """Whether the latest ranges have the scale of the sound revolution, rather than still ``scale`` times that."""
+    cloud = Cloud.of(sound.scan)
+    rescaled = _rescaled(latest.scan, latest.origin, 1.0 / scale)
+    still, back = (_fits(scan, cloud, motion) for scan in (rescaled, latest.scan))
+    return _refuted(still, back, latest, sound)
+
+
+def _refuted(others: Marks, fits: Marks, latest: Revolution, earlier: Revolution) -> bool:
+    """Whether the points that fit at the scale of ``latest`` refute the other scale, at which ``others`` fit.
+
+    Nothing else changes with the scale: every point that does not fit is evidence against it, unless the earlier
+    revolution did not reach so far.
+    """
     reach = _polar(earlier.scan.points, earlier.origin)[1].max()
-    judged = _polar(rescaled.points, latest.origin)[1] <= reach
-    alone, misfits = (int(np.count_nonzero(points & judged)) for points in (scaled & ~moved, ~scaled))
-    return factor if ScanVerdict(claimed=misfits, own=alone, misfits=misfits).refuted else None
+    judged = _polar(latest.scan.points, latest.origin)[1] <= reach
+    alone, misfits = (int(np.count_nonzero(points & judged)) for points in (fits & ~others, ~fits))
+    return ScanVerdict(claimed=misfits, own=alone, misfits=misfits).refuted
 
 
-def _fits(scan: Scan, cloud: Cloud, motion: Array) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def _fits(scan: Scan, cloud: Cloud, motion: Array) -> Marks:
     return fitting(scan, cloud, register(scan, cloud, motion).pose)
 
 

@@ -107,6 +107,17 @@ def test_ranges_that_change_back_unnoticed_are_sound_once_they_fit_those_before_
     assert math.prod(factor for factor in found if factor) == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize(("factor", "first"), [(1.1, 140), (1.15, 160), (1.25, 180), (0.8, 120)])
+def test_one_wall_beside_a_cover_does_not_show_that_the_ranges_have_changed_back(factor, first):
+    """Its points fit the ranges before the change by a translation."""
+    pose, watch = np.array(LANE[0][:3], float), ScaleWatch()
+    clean = ranges(HALL, pose)
+    wall = np.where((np.arange(len(clean)) >= first) & (np.arange(len(clean)) < first + 40), factor * clean, np.nan)
+    seen = (clean, factor * clean, wall, factor * clean, clean)
+    found = [watch.change(revolution(one), [np.zeros(3)] * 2) for one in seen]
+    assert found == [None, pytest.approx(factor, rel=0.01), None, None, pytest.approx(1.0 / factor, rel=0.01)]
+
+
 def test_a_lidar_that_was_restarted_has_no_earlier_scale():
     pose, watch = np.array(LANE[0][:3], float), ScaleWatch()
     clean, still = revolution(ranges(HALL, pose)), [np.zeros(3)] * 2
