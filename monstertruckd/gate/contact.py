@@ -76,6 +76,10 @@ class ContactCheck(Check):
         """Time when each shaft reached its commanded speed, ns."""
         self._rolling: dict[int, deque[float]] = {}
         """Latest motor currents of each shaft while the robot rolled freely, positive along the motion, A."""
+        self._readings: dict[int, float] = {}
+        """Latest motor current of each shaft, also at other speeds, A."""
+        self._steps: dict[int, float] = {}
+        """Smallest difference between two successive readings of each shaft's current, A: their resolution."""
         self._slow: dict[str, Lasting] = {}
         self._encoders: WheelEncoders | None = None
         self._request: DriveRequest | None = None
@@ -183,6 +187,11 @@ class ContactCheck(Check):
         return len(reached) == len(self.view.motion.shaft_speeds) and stamp - max(reached) >= SETTLED
 
     def _take_drive(self, feedback: DriveFeedback, shaft: int) -> None:
+        if feedback.current is not None:
+            step = abs(feedback.current - self._readings.get(shaft, feedback.current))
+            if step:
+                self._steps[shaft] = min(step, self._steps.get(shaft, step))
+            self._readings[shaft] = feedback.current
         commanded = self.view.motion.shaft_speeds[shaft]
         if self._touched is not None or feedback.mode is not DriveMode.ENABLED or not commanded:
             self._reached.pop(shaft, None)
@@ -200,7 +209,8 @@ class ContactCheck(Check):
             known = self._rolling.setdefault(shaft, deque(maxlen=20))  # number of rolling currents kept for each motor
             enough = 10  # number of rolling currents that replace ``ContactConfig.rolling``
             measured_it, near = len(known) >= enough, self.view.confirmed or self.view.dock is not None
-            limit = _current_limit(known if measured_it else (self._config.rolling,), self._config.rise)
+            usual = known if measured_it else (self._config.rolling,)
+            limit = _current_limit(usual, self._config.rise, self._steps.get(shaft, 0.0))
             load = sign * feedback.current
             # Elsewhere the robot first measures its rolling current, which differs between motors.
             if load > limit and (measured_it or near):
@@ -248,10 +258,13 @@ class ContactCheck(Check):
             self._slow.clear()
 
 
-def _current_limit(rolling: Sequence[float], rise: float) -> float:
+def _current_limit(rolling: Sequence[float], rise: float, step: float) -> float:
     """Return the current above the rolling currents (A) by more than a share of them, ``rise``, and than their noise.
 
-    Downhill a motor rolls with hardly any current, or brakes: there the noise decides.
+    Downhill a motor rolls with hardly any current, or brakes: there the noise decides. Readings of 0 hide noise below
+    half their resolution, ``step`` (A), so its rounding error counts as noise.
     """
-    usual, sigmas = median(rolling), 5.0  # significance
-    return usual + max(rise * abs(usual), sigmas * pstdev(rolling))
+    usual, noise, sigmas = median(rolling), pstdev(rolling), 5.0  # significance
+    if not usual:
+        noise = math.hypot(noise, step / math.sqrt(12.0))
+    return usual + max(rise * abs(usual), sigmas * noise)

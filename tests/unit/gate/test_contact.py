@@ -339,3 +339,33 @@ def test_the_noise_of_a_motor_that_hardly_draws_current_is_no_contact(load):
     rig.extra = lambda: None
     rig.load = 0.3
     assert rig.until(Reason.CONTACT) is not None
+
+
+@pytest.mark.parametrize(("usual", "noise"), [(0.0, 0.0), (0.0, 0.004), (0.02, 0.004)])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_step_of_a_rounded_current_is_no_contact(usual, noise, seed):
+    """The drive reports multiples of 10 mA, which hide noise below half of that."""
+    rig = Backing(scan={"stale_after": 0.25, "critical": False})
+    rig.silent, rig.driver, rng = {"scan"}, {"speed": 0.15}, random.Random(seed)
+
+    def rounded():
+        rig.load = round((usual + rng.gauss(0.0, noise)) / 0.01) * 0.01
+
+    rig.extra = rounded
+    assert rig.until(Reason.CONTACT, ticks=200) is None
+    usual += 0.006
+    assert rig.until(Reason.CONTACT, ticks=800) is None
+    rig.extra, rig.load = lambda: None, 0.1
+    assert rig.until(Reason.CONTACT) is not None
+
+
+def test_a_motor_whose_current_reads_zero_measures_none():
+    """The other measures still show a contact."""
+    rig = Backing(scan={"stale_after": 0.25, "critical": False})
+    rig.silent, rig.driver, rig.load = {"scan"}, {"speed": 0.15}, 0.0
+    assert rig.until(Reason.CONTACT, ticks=200) is None
+    rig.load = 0.5
+    assert rig.until(Reason.CONTACT, ticks=50) is None
+    rig._obey = lambda: None
+    rig.load, rig.speed = 0.0, 0.0
+    assert rig.until(Reason.CONTACT) <= 0.3
