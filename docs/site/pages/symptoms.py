@@ -130,7 +130,7 @@ SYMPTOMS: Final = (
             "unwitnessed": "`monstertruckd doctor` names the missing sensor.",
             "imu_disagrees": "Check that it is screwed down; `monstertruckd calibrate imu`.",
             "time_offset": "`monstertruckd calibrate lidar` prints the offset.",
-            "lidar_turned": "`monstertruckd calibrate lidar`.",
+            "lidar_turned": "`monstertruckd calibrate lidar`; if the robot crabs: `monstertruckd calibrate steering`.",
             "odometry_dropped": "Check the wheels; calibrate drive and odometry.",
             "pose_lost": "Drive slowly where the lidar sees many walls.",
             "match_degenerate": "A bare corridor: the pose continues by odometry.",

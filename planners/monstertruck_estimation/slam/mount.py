@@ -45,7 +45,10 @@ class MountEstimate:
         if abs(self.yaw) < LEAST_YAW + sure * self.deviation:
             return None
         text = f"{math.degrees(self.yaw):+.1f} degrees (standard deviation {math.degrees(self.deviation):.1f})"
-        return f"the lidar is turned by {text} against its mount: add that to its yaw, or run `calibrate lidar`"
+        return (
+            f"odometry and scans differ by {text} in direction. Either the lidar is turned against its mount: add "
+            "that to its yaw, or run `calibrate lidar`. Or both axles steer to one side: run `calibrate steering`"
+        )
 
 
 class MountEstimator:

@@ -10,7 +10,7 @@ from monstertruck_estimation.slam.mapping import MappingEstimator
 from monstertruck_estimation.slam.mount import MountEstimate, mount_of
 from monstertruck_estimation.slam.scans import prepare_input
 from monstertruck_estimation.slam.worker_io import ScanInput
-from monstertruck_kinematics.se2 import compose
+from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 from tests.unit.estimation.slam.kit import HALL, LIDAR, drifting, ranges, rounds
 
@@ -34,7 +34,22 @@ def test_a_turned_lidar_is_found_to_a_third_of_a_degree(degrees: float):
     assert found is not None
     assert math.degrees(found.yaw) == pytest.approx(degrees, abs=0.3)
     assert found.fault is not None
-    assert f"turned by {math.degrees(found.yaw):+.1f} degrees" in found.fault
+    assert f"differ by {math.degrees(found.yaw):+.1f} degrees" in found.fault
+
+
+def test_a_robot_that_crabs_looks_like_a_turned_lidar_and_both_causes_are_named():
+    """Both axles trimmed to the left by 3 degrees: odometry knows nothing of it."""
+    steps = between(TRUTH[:-1], TRUTH[1:])
+    turn = compose(np.array((0.0, 0.0, math.radians(3.0))), steps)
+    steps[:, :2] = turn[:, :2]
+    path = [TRUTH[0]]
+    for step in steps:
+        path.append(compose(path[-1], step))
+    found = check(np.array(path))
+    assert found is not None
+    assert math.degrees(found.yaw) == pytest.approx(-3.0, abs=0.3)
+    assert "the lidar is turned against its mount: add that to its yaw, or run `calibrate lidar`" in str(found.fault)
+    assert "both axles steer to one side: run `calibrate steering`" in str(found.fault)
 
 
 def test_a_right_mount_is_no_fault():
@@ -81,7 +96,7 @@ def test_a_lidar_that_sits_elsewhere_on_the_robot_is_not_turned():
 
 
 @pytest.mark.parametrize(
-    ("yaw", "turns", "fault"), [(0.0, 1, None), (-5.0, 1, "turned by -"), (0.0, -1, "upside down")]
+    ("yaw", "turns", "fault"), [(0.0, 1, None), (-5.0, 1, "differ by -"), (0.0, -1, "upside down")]
 )
 def test_mapping_reports_the_mount_within_twenty_seconds(yaw: float, turns: int, fault: str | None):
     truth, rng = rounds(150, laps=0.7, width=3.6, height=2.2), np.random.default_rng(2)

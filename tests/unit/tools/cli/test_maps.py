@@ -51,11 +51,13 @@ def test_a_lidar_that_is_not_mounted_as_given_is_reported(log: Path, tmp_path: P
     arguments = [log, "-o", tmp_path / "map", "--start-angle", np.degrees(LIDAR.start_angle), "--range-max", "5.6",
                  "--angle-increment", np.degrees(LIDAR.angle_increment), "--json"]  # fmt: skip
     right = CliRunner().invoke(app, ["map", "build", *map(str, arguments)])
-    assert "turned by" not in right.stderr
+    assert "the lidar is turned" not in right.stderr
     assert abs(json.loads(right.stdout)["lidar_yaw_off"]) < np.radians(1)
     wrong = CliRunner().invoke(app, ["map", "build", *map(str, arguments), "--mount", "0", "0", "5"])
     assert np.degrees(json.loads(wrong.stdout)["lidar_yaw_off"]) == pytest.approx(-5, abs=1)
-    assert "the lidar is turned by -" in wrong.stderr
+    assert "odometry and scans differ by -" in wrong.stderr
+    assert "the lidar is turned against its mount" in wrong.stderr
+    assert "calibrate steering" in wrong.stderr
 
 
 def arrays_of(log: Path) -> dict[str, np.ndarray]:
