@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_estimation.slam.budget import ScanBudget
-from monstertruck_estimation.slam.changes import ChangeDetector
-from monstertruck_estimation.slam.closure import CONTRADICTION, PART_CONTRADICTION, LoopCloser
+from monstertruck_estimation.slam.closure import CONTRADICTION, PART_CONTRADICTION, ChangeDetector, LoopCloser
 from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.correlation import Submap
 from monstertruck_estimation.slam.grid import NONE, GridBuilder, passed_ends
