@@ -135,7 +135,7 @@ class Reason(StrEnum):
     POSE_LOST = "pose_lost", 90, "the scans do not fit the map: the pose is odometry alone"
     MATCH_DEGENERATE = "match_degenerate", 91, "the scans say nothing along one direction"
     TIME_OFFSET = "time_offset", 92, "odometry and scans are stamped by clocks that disagree"
-    LIDAR_TURNED = "lidar_turned", 92, "the lidar is turned against its configured mount, or upside down"
+    LIDAR_TURNED = "lidar_turned", 92, "the lidar is turned relative to its configured mount, or upside down"
     SCAN_LEFT_OUT = "scan_left_out", 93, "a scan cannot be used"
     WHEEL_SLIP = (
         "wheel_slip",
