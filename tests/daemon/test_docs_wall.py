@@ -62,6 +62,8 @@ async def test_a_line_that_serves_is_ready_and_ends_by_ctrl_c(line: str, tmp_pat
     self_signed(tmp_path)
     add_user(tmp_path / "users.yaml", "ann", AccessRole.PILOT, "the password of ann")
     words = [*Line("", line).arguments, "--port", free_endpoint().rpartition(":")[2]]
+    if not {"--robot", "--router"}.intersection(words):  # other tests run robots on this computer
+        words += ["--robot", f"truck@{free_endpoint()}"]
     if "--foxglove" in words:
         words += ["--foxglove-port", free_endpoint().rpartition(":")[2]]
     with (tmp_path / "output.txt").open("w") as file:
