@@ -3,8 +3,8 @@
     python benchmarks/record.py NAME --measures PATH [PATH ...] -- benchmarks/deaths.py --trials 20
 
 A benchmark that runs as a module is given as ``-m benchmarks.thesis``. NAME is that of the file. The benchmark's last
-line gives figures and goals; Markdown tables in its output become the tables ``1``, ``2`` ... Pages that link them show
-them on the site.
+line gives figures and goals; Markdown tables in its output become the tables ``1``, ``2`` ..., or keep the names that
+tables with the same headings had in the file. Pages that link them show them on the site.
 """
 
 import argparse
@@ -44,6 +44,17 @@ def program(command: str) -> Path:
     return place / "__main__.py" if place.is_dir() else place.with_suffix(".py")
 
 
+def named(found: dict[str, list[list[str]]], before: dict[str, list[list[str]]]) -> dict[str, list[list[str]]]:
+    """Return the tables ``found`` by the names of those ``before`` that have the same headings, each used once."""
+    left = dict(before)
+    names = {}
+    for number, rows in found.items():
+        name = next((name for name, old in left.items() if old[:1] == rows[:1]), number)
+        left.pop(name, None)
+        names[name] = rows
+    return names
+
+
 def record(output: str, command: str, measures: list[str], commit: str, machine: str) -> dict[str, Any]:
     """Return the content of a figures file.
 
@@ -52,10 +63,10 @@ def record(output: str, command: str, measures: list[str], commit: str, machine:
     """
     try:
         result = json.loads(output.strip().splitlines()[-1])
-        named = {key: result[key] for key in ("bench", "figures", "goals", "met")}
+        last = {key: result[key] for key in ("bench", "figures", "goals", "met")}
     except (ValueError, IndexError, KeyError, TypeError) as error:
         raise ValueError(f"the last line of the output is not a benchmark's result: {error!r}") from error
-    return {"command": command, "commit": commit, "machine": machine, "measures": measures, **named} | {
+    return {"command": command, "commit": commit, "machine": machine, "measures": measures, **last} | {
         "tables": tables(output)
     }
 
@@ -80,7 +91,11 @@ def main() -> int:
     )
     sys.stdout.write(done.stdout)
     content = record(done.stdout, " ".join(["python", *arguments.command]), arguments.measures, commit, before)
-    (FOLDER / f"{arguments.name}.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    file = FOLDER / f"{arguments.name}.json"
+    if file.exists():
+        earlier = json.loads(file.read_text(encoding="utf-8"))["tables"]
+        content["tables"] = named(content["tables"], earlier)
+    file.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     return done.returncode
 
 

@@ -549,6 +549,7 @@ def distance_from_fit(plot: Plot) -> float:
 
     A range less than 1 % of its values counts as 1 % of them: the spread of a repeated measurement.
     """
+    assert len(plot.points)
     assert np.isfinite(plot.points).all()
     if plot.curve is None:
         return 0.0

@@ -7,6 +7,7 @@ of the time. Wheels are right, so every scan at which they are dropped counts; a
 """
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from monstertruck_estimation.slam.scans import ScanGeometry, prepare_input
 from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_kinematics.se2 import between, compose
 from monstertruck_schemas.health import LocalisationStatus, OdometryUse
-from slam_parts.drawn import MAPS, PERIOD, REACH, drawn
+from slam_parts.drawn import PERIOD, REACH, over_drives
 
 SHARES = (0.1, 0.2, 0.3, 0.4)
 SEEDS = 5
@@ -34,19 +35,13 @@ WRONG, UNREPORTED = 0.10, 3.0
 
 def run(folder: Path, *, quick: bool) -> tuple[dict[str, float], dict[str, float], bool]:
     """Figures, goals, and whether all are met."""
-    figures: dict[str, float] = {}
-    goals: dict[str, float] = {}
-    for name in MAPS:
-        for seed in range(1, 2 if quick else SEEDS + 1):
-            log = drawn(folder.parent / "maps", name, seed)
-            for share in (0.0, *SHARES):
-                found = followed(log, name, seed, share)
-                key = f"crowds.{name}-{seed}.{100 * share:.0f}"
-                print(key, found, flush=True)
-                figures |= {f"{key}.{what}": round(value, 4) for what, value in found.items()}
-                if share:
-                    goals |= {f"{key}.unreported_s": UNREPORTED, f"{key}.dropped": 0}
-    return figures, goals, all(figures[key] <= goal for key, goal in goals.items())
+
+    def cases(log: tuple, name: str, seed: int) -> Iterator[tuple[str, dict[str, float], dict[str, float]]]:
+        for share in (0.0, *SHARES):
+            goals = {"unreported_s": UNREPORTED, "dropped": 0.0} if share else {}
+            yield f"{100 * share:.0f}", followed(log, name, seed, share), goals
+
+    return over_drives(folder, "crowds", 1 if quick else SEEDS, cases)
 
 
 def followed(

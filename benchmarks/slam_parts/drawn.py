@@ -5,6 +5,7 @@ scales, a drift and noise, drawn too. Nothing moves; scans are taken at an insta
 """
 
 import math
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.map_files import FREE, OCCUPIED, WorldMap, load_map
 
+Found = dict[str, float]
 MAPS = {"hospital": "stdr_hospital_section", "depot": "nav2_depot", "robocup": "stdr_robocup"}
 WAY, STEP, PERIOD = 240.0, 0.1, 0.2
 """Driven, m; between two scans at most, m, and s. Where it turns, scans are no more than ``TURN`` rad apart."""
@@ -40,6 +42,25 @@ def drawn(folder: Path, name: str, seed: int) -> tuple[np.ndarray, np.ndarray, n
     ranges = np.where(ranges < REACH, ranges + rng.normal(0.0, NOISE, ranges.shape), REACH + 1.0)
     stamps = (np.arange(len(poses)) * PERIOD * SECOND).astype(np.int64)
     return stamps, ranges, _odometry(poses, rng), poses, ScanGeometry(-HALF_VIEW, step, 0.05, REACH)
+
+
+def over_drives(
+    folder: Path, part: str, seeds: int, measure: Callable[[tuple, str, int], Iterator[tuple[str, Found, Found]]]
+) -> tuple[Found, Found, bool]:
+    """Figures and goals of ``part`` in every map, for so many seeds, and whether all goals are met.
+
+    ``measure`` gets a log, and the name of its map and its seed; it yields a case, its figures and its goals.
+    """
+    figures: Found = {}
+    goals: Found = {}
+    for name in MAPS:
+        for seed in range(1, seeds + 1):
+            for case, found, least in measure(drawn(folder.parent / "maps", name, seed), name, seed):
+                key = f"{part}.{name}-{seed}.{case}"
+                print(key, found, flush=True)
+                figures |= {f"{key}.{what}": round(value, 4) for what, value in found.items()}
+                goals |= {f"{key}.{what}": value for what, value in least.items()}
+    return figures, goals, all(figures[key] <= goal for key, goal in goals.items())
 
 
 def _way(world: WorldMap, rng: np.random.Generator) -> np.ndarray:

@@ -14,7 +14,7 @@ from monstertruck_estimation.slam.mapping import MappingEstimator
 from monstertruck_estimation.slam.mount import mount_of
 from monstertruck_estimation.slam.scans import prepare_input
 from monstertruck_estimation.slam.worker_io import ScanInput
-from slam_parts.drawn import MAPS, PERIOD, drawn
+from slam_parts.drawn import PERIOD, over_drives
 
 KINDS = ("right", "2", "-5", "10", "mirrored", "late")
 """Turned by degrees, beams in reverse, or seen ``PERIOD`` seconds later than stamped."""
@@ -26,18 +26,9 @@ YAW, OFFSET = 0.3, 0.01
 
 def run(folder: Path, *, quick: bool) -> tuple[dict[str, float], dict[str, float], bool]:
     """Figures, goals, and whether all are met."""
-    figures: dict[str, float] = {}
-    goals: dict[str, float] = {}
-    for name in MAPS:
-        for seed in range(1, 2 if quick else SEEDS + 1):
-            log = drawn(folder.parent / "maps", name, seed)
-            for kind in KINDS:
-                found, least = mounted(log, kind)
-                key = f"mounts.{name}-{seed}.{kind}"
-                print(key, found, flush=True)
-                figures |= {f"{key}.{what}": round(value, 4) for what, value in found.items()}
-                goals |= {f"{key}.{what}": value for what, value in least.items()}
-    return figures, goals, all(figures[key] <= goal for key, goal in goals.items())
+    return over_drives(
+        folder, "mounts", 1 if quick else SEEDS, lambda log, *_: ((kind, *mounted(log, kind)) for kind in KINDS)
+    )
 
 
 def mounted(log: tuple, kind: str) -> tuple[dict[str, float], dict[str, float]]:

@@ -1,14 +1,12 @@
 """Settings that all scanners with a turning head share."""
 
-import math
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
 from monstertruck_drivers.emulation import RangeSheet
 from monstertruck_schemas.base import FrameId, Schema
-
-Bearing = Annotated[float, Field(ge=-math.pi, le=math.pi)]
+from monstertruck_schemas.body import HalfTurn
 
 
 def sheet(settings: Any) -> RangeSheet:
@@ -23,7 +21,7 @@ class ScannerConfig(Schema):
 
     frame: FrameId | None = None
     """Frame of the published scans; null: named like the role"""
-    hidden: Annotated[tuple[tuple[Bearing, Bearing], ...], Field(strict=False)] = ()
+    hidden: Annotated[tuple[tuple[HalfTurn, HalfTurn], ...], Field(strict=False)] = ()
     """Sectors hidden by parts of the robot such as a mast: first and last bearing counter-clockwise in the published
     scans (rad); they are outside the field of view"""
 

@@ -46,7 +46,7 @@ class MountEstimate:
             return None
         text = f"{math.degrees(self.yaw):+.1f} degrees (standard deviation {math.degrees(self.deviation):.1f})"
         return (
-            f"odometry and scans differ by {text} in direction. Either the lidar is turned against its mount: add "
+            f"odometry and scans differ by {text} in direction. Either the lidar is turned relative to its mount: add "
             "that to its yaw, or run `calibrate lidar`. Or both axles steer to one side: run `calibrate steering`"
         )
 

@@ -3,7 +3,6 @@
 import importlib
 import inspect
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +14,8 @@ PINNED = ROOT / "tests" / "data" / "api.json"
 
 
 @pytest.fixture
-def api(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.syspath_prepend(str(ROOT / "docs" / "site"))
-    from pages import api
-
-    yield api
-    for name in [name for name in sys.modules if name == "pages" or name.startswith("pages.")]:
-        del sys.modules[name]
+def api(site_module):
+    return site_module("api")
 
 
 def parameters(of: Any) -> list[str]:

@@ -1,24 +1,15 @@
 """The pages on the command line and on the reasons name the exit codes and keys there are."""
 
-import sys
 from pathlib import Path
-
-import pytest
 
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.driving.modes import SPEEDS, SteeringMode
 
-SITE = Path(__file__).resolve().parents[3] / "docs" / "site"
 PAGE = (Path(__file__).resolve().parents[3] / "docs" / "command-line.md").read_text()
 
 
-def test_every_reason_is_in_the_table_with_its_code(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.syspath_prepend(str(SITE))
-    from pages import reasons
-
-    text = reasons.page().text
-    for name in [name for name in sys.modules if name == "pages" or name.startswith("pages.")]:
-        del sys.modules[name]
+def test_every_reason_is_in_the_table_with_its_code(site_module):
+    text = site_module("reasons").page().text
     rows = [line for line in text.splitlines() if line.startswith("| ")][2:]
     assert rows == sorted(rows, key=lambda row: int(row.split("|")[1]))
     assert sorted(rows) == sorted(f"| {each.exit_code} | `{each.value}` | {each.text} |" for each in Reason)

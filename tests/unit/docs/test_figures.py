@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks import older_figures
 from benchmarks.older_figures import known, latest_commit, rows
-from benchmarks.record import program, record, tables
+from benchmarks.record import named, program, record, tables
 
 ROOT = Path(__file__).resolve().parents[3]
 DOCS = ROOT / "docs"
@@ -27,13 +27,8 @@ STATED = ROOT / "tests" / "data" / "stated_numbers.json"
 
 
 @pytest.fixture
-def figures(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.syspath_prepend(str(DOCS / "site"))
-    from pages import figures
-
-    yield figures
-    for name in [name for name in sys.modules if name == "pages" or name.startswith("pages.")]:
-        del sys.modules[name]
+def figures(site_module):
+    return site_module("figures")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -138,3 +133,10 @@ def test_an_incomplete_command_line_of_record_is_refused():
     )
     assert done.returncode == 2
     assert "--measures" in done.stderr
+
+
+def test_a_table_recorded_again_keeps_its_name():
+    deaths, modes = [["cause", "stands after"], ["kill", "3 s"]], [["mode", "rate"], ["a", "4"]]
+    before = {"deaths": [deaths[0], ["kill", "9 s"]], "gone": [["other"]]}
+    assert named({"1": modes, "2": deaths}, before) == {"1": modes, "deaths": deaths}
+    assert named({"1": deaths, "2": deaths}, before) == {"deaths": deaths, "2": deaths}

@@ -1,7 +1,6 @@
 """The generated reference explains every key of the configuration, every field of a topic, and every option."""
 
 import re
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +13,8 @@ from tests.unit.docs.command_lines import PAGES, ROOT, commands_of, resolve
 
 
 @pytest.fixture
-def definitions(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.syspath_prepend(str(ROOT / "docs" / "site"))
-    from pages.models import Definitions
-
-    yield Definitions
-    for name in [name for name in sys.modules if name == "pages" or name.startswith("pages.")]:
-        del sys.modules[name]
+def definitions(site_module):
+    return site_module("models").Definitions
 
 
 def unexplained(found: Any) -> set[str]:

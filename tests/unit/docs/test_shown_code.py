@@ -1,7 +1,6 @@
 """The code that pages show is the code that runs: the site takes it from the files that they link."""
 
 import re
-import sys
 from pathlib import Path
 
 import pytest
@@ -12,13 +11,8 @@ PAGES = sorted(SITE.parent.glob("writing-*.md"))
 
 
 @pytest.fixture
-def source(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.syspath_prepend(str(SITE))
-    from pages import source
-
-    yield source
-    for name in [name for name in sys.modules if name == "pages" or name.startswith("pages.")]:
-        del sys.modules[name]
+def source(site_module):
+    return site_module("source")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=[page.name for page in PAGES])

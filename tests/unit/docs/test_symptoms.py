@@ -1,6 +1,5 @@
 """The page of symptoms lists every reason once, with a remedy."""
 
-import sys
 from pathlib import Path
 
 from monstertruck_schemas.reasons import Reason
@@ -8,12 +7,8 @@ from monstertruck_schemas.reasons import Reason
 SITE = Path(__file__).resolve().parents[3] / "docs" / "site"
 
 
-def test_every_reason_that_is_no_success_has_its_symptom():
-    sys.path.insert(0, str(SITE))
-    try:
-        from pages import symptoms
-    finally:
-        sys.path.remove(str(SITE))
+def test_every_reason_that_is_no_success_has_its_symptom(site_module):
+    symptoms = site_module("symptoms")
     named = [name for symptom in symptoms.SYMPTOMS for name in symptom.reasons]
     assert len(named) == len(set(named))
     assert set(named) == {reason.value for reason in Reason if reason.exit_code}

@@ -48,7 +48,9 @@ def test_a_robot_that_crabs_looks_like_a_turned_lidar_and_both_causes_are_named(
     found = check(np.array(path))
     assert found is not None
     assert math.degrees(found.yaw) == pytest.approx(-3.0, abs=0.3)
-    assert "the lidar is turned against its mount: add that to its yaw, or run `calibrate lidar`" in str(found.fault)
+    assert "the lidar is turned relative to its mount: add that to its yaw, or run `calibrate lidar`" in str(
+        found.fault
+    )
     assert "both axles steer to one side: run `calibrate steering`" in str(found.fault)
 
 

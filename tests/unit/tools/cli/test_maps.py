@@ -56,7 +56,7 @@ def test_a_lidar_that_is_not_mounted_as_given_is_reported(log: Path, tmp_path: P
     wrong = CliRunner().invoke(app, ["map", "build", *map(str, arguments), "--mount", "0", "0", "5"])
     assert np.degrees(json.loads(wrong.stdout)["lidar_yaw_off"]) == pytest.approx(-5, abs=1)
     assert "odometry and scans differ by -" in wrong.stderr
-    assert "the lidar is turned against its mount" in wrong.stderr
+    assert "the lidar is turned relative to its mount" in wrong.stderr
     assert "calibrate steering" in wrong.stderr
 
 
