@@ -86,8 +86,9 @@ class TurnCutter:
 def on_equal_steps(samples: BeamSamples) -> HeadTurn | None:
     """Resample a revolution to equal steps, each sample at the nearest step; None if too few samples define the step.
 
-    Of two samples at one step, the shorter range is kept. The step is the mean spacing of neighbours. The first beam is
-    at the mean phase of the samples, so no sample moves by more than half a step while the head turns evenly.
+    Of two samples at one step, the shorter range is kept. The step is the mean spacing of neighbours. The beams are at
+    the mean phase of the samples, so no sample moves by more than half a step while the head turns evenly. The last
+    beam is at the last sample: of one sample more than steps, the first is dropped, as the last has its direction.
 
     Args:
         samples: one revolution, with angles after the cut, 0 to 1.
@@ -99,7 +100,10 @@ def on_equal_steps(samples: BeamSamples) -> HeadTurn | None:
         return None
     count = max(round(1.0 / step), 1)
     phase = float(np.angle(np.exp(2j * np.pi * turns * count).mean())) / (2.0 * np.pi)
-    beams = np.clip(np.rint(turns * count - phase).astype(np.intp), 0, count - 1)
+    beams = np.rint(turns * count - phase).astype(np.intp)
+    first = max(int(beams[-1]) - count + 1, 0)
+    order, beams = order[beams >= first], beams[beams >= first] - first
+    phase += first
     rate, begin = np.polyfit(samples.turns, samples.times, 1)
     if rate <= 0.0:
         return None

@@ -9,11 +9,15 @@ from monstertruck_drivers.scanning.turns import MISSING, ArrivalTimes, BeamSampl
 from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM
 
 
-def samples(turns, begin=0.0, period=1e8):
-    """Of a head that turns evenly; the range tells the angle behind the rear."""
+def samples(turns, begin=0.0, period=1e8, *, falling=False):
+    """Of a head that turns evenly; the range tells the angle behind the rear, or the angle left to it."""
     turns = np.asarray(turns, np.float64)
+    behind = (turns - 0.5) % 1.0
     return BeamSamples(
-        turns % 1.0, 1.0 + (turns - 0.5) % 1.0, np.full(len(turns), 7, np.uint8), begin + (turns - 0.5) * period
+        turns % 1.0,
+        2.0 - behind if falling else 1.0 + behind,
+        np.full(len(turns), 7, np.uint8),
+        begin + (turns - 0.5) * period,
     )
 
 
@@ -22,13 +26,15 @@ def samples(turns, begin=0.0, period=1e8):
     first=st.floats(0, 1, exclude_max=True),
     count=st.floats(60, 1500),
     pieces=st.integers(1, 40),
+    falling=st.booleans(),
 )
-@example(first=0.5, count=60.0, pieces=1)
-def test_every_whole_turn_comes_once_however_it_is_cut(first, count, pieces):
+@example(first=0.5, count=60.0, pieces=1, falling=False)
+@example(first=0.0, count=2000 / 5.5, pieces=1, falling=True)
+def test_every_whole_turn_comes_once_however_it_is_cut(first, count, pieces, falling):
     turns = first + np.arange(round(3.6 * count)) / count
     cutter, found = TurnCutter(), []
     for part in np.array_split(turns, pieces):
-        found += cutter.add(samples(part))
+        found += cutter.add(samples(part, falling=falling))
     # a revolution whose first sample is the first of all may have begun before it
     whole = int(np.floor(turns[-1] - 0.5) - (np.floor(first - 0.5) + 1))
     assert len(found) == whole
@@ -38,7 +44,8 @@ def test_every_whole_turn_comes_once_however_it_is_cut(first, count, pieces):
         assert np.isfinite(turn.ranges).sum() >= len(turn.ranges) - 1
         angle = 1.0 + turn.first + turn.step * np.arange(len(turn.ranges))
         met = np.isfinite(turn.ranges)
-        assert np.abs(np.mod(turn.ranges - angle + 0.5, 1.0) - 0.5)[met].max() < 0.51 / count
+        shown = 3.0 - turn.ranges if falling else turn.ranges
+        assert np.abs(np.mod(shown - angle + 0.5, 1.0) - 0.5)[met].max() < 0.51 / count
         assert turn.period == pytest.approx(1e8, rel=1e-6)
         assert (turn.begin - turn.first * 1e8 + 5e7) % 1e8 == pytest.approx(5e7, abs=10.0)
 
