@@ -43,7 +43,7 @@ class DeviceEnd:
         self._deliver: Callable[[bytes], None] | None = None
 
     def connect(self, deliver: Callable[[bytes], None] | None) -> None:
-        """A host opened the port, or closed it (None)."""
+        """Connect the host that opened the port; None when it closes the port."""
         self._deliver = deliver
 
     async def read(self, within: float | None = None) -> bytes:
@@ -55,7 +55,7 @@ class DeviceEnd:
         return await self._received.read(within)
 
     def write(self, data: bytes, after: float = 0.0) -> None:
-        """Send to the host ``after`` seconds, through baud pacing and line faults."""
+        """Send to the host ``after`` seconds from now, subject to baud pacing and line faults."""
         for chunk in self.faults.corrupt(data):
             self._send(self._out, len(chunk), partial(self._emit, chunk), after)
 

@@ -54,14 +54,15 @@ class RoleSpec:
     duty: Duty
     doc: str
     writes: Mapping[str, Topic[Any]]
-    """Topics by the driver's parameter. The first is the role's main topic; any other is left out (the driver gets
-    None) if it is the main topic of another configured device."""
+    """Topics written, by driver parameter. The first is the role's main topic. If another one is the main topic of
+    another configured device, the driver gets None for it.
+    """
     reads: Mapping[str, Topic[Any]] = field(default_factory=dict)
-    """Topics whose latest message is passed to the driver, by the driver's parameter."""
+    """Topics read, by driver parameter; the driver receives the latest message of each."""
     frame: bool = False
-    """Whether the tree of frames contains its mount."""
+    """Whether the frame tree contains its mount."""
     elements: str | None = None
-    """Field of the driver's settings with several sensing elements by name; the tree of frames contains their mounts as
+    """Settings field that lists several sensing elements by name; the frame tree contains their mounts as
     ``<role>_<name>``.
     """
     start: int = 11
@@ -242,18 +243,17 @@ class UsbIdentity(NamedTuple):
 class DeviceKind(Plugin):
     """One kind of device; ``implementation`` is its driver.
 
-    A driver is a ``Service``, created with its settings, the opened port, the clock, and by name the ends of its role's
-    topics, ``events`` and ``name``.
+    A driver is a ``Service``. Its constructor takes the settings, the opened port, the clock, and as keywords the ends
+    of its role's topics, ``events`` and ``name``.
     """
 
     roles: tuple[RoleSpec, ...]
     """Roles it can fill."""
     emulator: str
-    """Place ``module:function``: builds an ``Emulator``, or a ``FileEmulator`` for a monitor, from an
-    ``EmulatorSetup``."""
+    """``module:function`` that builds an ``Emulator`` (a ``FileEmulator`` for a monitor) from an ``EmulatorSetup``."""
     identity: str
-    """Place ``module:function``: a coroutine function that receives what ``identify`` opens, the clock and the driver's
-    settings; returns facts for JSON by name, without motion.
+    """``module:function`` of a coroutine function. It takes the object that ``identify`` opens, the clock and the
+    driver's settings, and returns facts by name (JSON-compatible), without motion.
     """
     also: Mapping[str, Topic[Any]] = field(default_factory=dict)
     """Topics written in addition to the role's topics, by the driver's parameter. The driver gets None if the topic is
@@ -277,7 +277,7 @@ class DeviceKind(Plugin):
         """Run an emulated device until cancelled.
 
         Raises:
-            InputError: an exception in its code.
+            InputError: the emulator's code raised an exception.
         """
         with self.refusing(self.emulator):
             await emulator.run(end)
@@ -342,8 +342,9 @@ class DeviceKind(Plugin):
 RESERVED: Final = frozenset(
     {*map(str, ServiceName), "at_present", "controller", "lidars", "measures", "present", "shafts", "steers"}
 )
-"""Names refused for roles of other distributions: services that are not devices, and keys of a configuration section
-besides its roles (a test compares)."""
+"""Names that roles of other distributions must not use: services that are not devices, and configuration keys that are
+not roles (a test compares).
+"""
 
 
 class DeviceCatalog(Catalog[DeviceKind]):

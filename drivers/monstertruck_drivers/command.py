@@ -1,4 +1,4 @@
-"""A program that acts as a device: its output is read over a link, and its end is the loss of the device."""
+"""Program that acts as a device: a link reads its output, and the device is lost when the program exits."""
 
 import asyncio
 from collections.abc import Sequence

@@ -60,7 +60,7 @@ SUBSYSTEMS: Final = ("usb", "tty", "video4linux")
 
 
 class Watcher(Protocol):
-    """Source of change announcements; it may miss some, so its user also polls."""
+    """Source of change notifications; it may miss some, so its user also polls."""
 
     def start(self, hint: Callable[[], None]) -> None:
         """Call ``hint`` on the running loop whenever something may have changed, until ``stop``."""
@@ -70,7 +70,7 @@ class Watcher(Protocol):
 
 
 class NoWatcher:
-    """Source for machines without announcements: the tree is only polled."""
+    """Watcher for machines without udev: the tree is only polled."""
 
     def start(self, hint: Callable[[], None]) -> None:
         """Do nothing."""
@@ -117,7 +117,7 @@ class UdevWatcher:
 
 
 def open_watcher() -> Watcher:
-    """Udev's announcements if the machine has udev, otherwise none."""
+    """Return a udev watcher if the machine has udev, otherwise one that reports nothing."""
     try:
         # LGPL, for robots only, and it loads a system library.
         import pyudev  # noqa: PLC0415
@@ -154,7 +154,7 @@ async def run_command(arguments: Sequence[str]) -> tuple[int, str]:
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """Files, nodes and programs; tests replace it by an emulated machine."""
+    """Files, nodes and programs; tests replace them with an emulated machine."""
 
     clock: Clock
     sysfs: Sysfs = field(default_factory=Sysfs)

@@ -100,7 +100,7 @@ _WAYS: Final = {"hub": "port by hub", "address": "port by address", "command": "
 
 
 def _way(port: Any) -> str:
-    """Which variant ``port`` is; not one of its keys, so that error messages find their line."""
+    """Return the tag of the union variant of ``port``: not one of its keys, so that error messages find their line."""
     keys = port if isinstance(port, dict) else vars(port) if isinstance(port, Schema) else {}
     return next((way for key, way in _WAYS.items() if key in keys), "port by path")
 

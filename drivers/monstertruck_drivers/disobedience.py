@@ -19,7 +19,7 @@ class Disobedience(StrEnum):
 
 
 class StoppedBy(StrEnum):
-    """The weakest way of stopping the motor that still works; the later ones work too."""
+    """Weakest stop that still works on the motor; the stronger ones, listed after it, work too."""
 
     STAGE = "stage"
     """Power stage off."""

@@ -21,7 +21,7 @@ class ImuCorrection(Schema):
     rate_z: float = 0.0
     """Bias about z (rad/s)"""
     rate_scale: Annotated[float, Field(ge=0.5, le=2)] = 1.0
-    """Factor on the angular velocity about z, its bias taken out"""
+    """Factor on the angular velocity about z, after its bias is subtracted"""
     force_x: float = 0.0
     """Bias of the specific force (m/s^2)"""
     force_y: float = 0.0

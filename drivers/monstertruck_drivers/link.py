@@ -1,7 +1,7 @@
-"""Byte links: one receive buffer, one way to lose the peer.
+"""Byte links, with one receive buffer and one state for the loss of the peer.
 
-A ``Port`` is a place a device can be plugged into; opening it gives a ``Link``. The host side never sees
-whether the bytes come from a tty, a pty or another coroutine.
+A device is plugged into a ``Port``; opening the port returns a ``Link``. Its users need not know whether the bytes come
+from a tty, a pty or another coroutine.
 """
 
 import asyncio
@@ -11,13 +11,13 @@ from typing import Literal, Protocol, Self
 from monstertruck_runtime.errors import DeviceLostError
 
 BAUD = 115200
-"""Bits per second of a line whose device takes any."""
+"""Default baud rate, for devices that accept any (bit/s)."""
 Framing = Literal["8N1", "8E2"]
-"""Bits of a byte on a serial line: data bits, parity, stop bits."""
+"""Format of a byte on a serial line: data bits, parity, stop bits."""
 BUFFER_LIMIT = 1 << 16
-"""Unread bytes kept; beyond that the oldest are dropped, as a tty's buffer would."""
+"""Maximum number of unread bytes; beyond it the oldest are dropped, as in a tty's buffer."""
 STREAM_LIMIT = 1 << 22
-"""Unread bytes kept of a socket or a program, which give up to 256 KiB at once."""
+"""Maximum number of unread bytes of a socket or a program, which deliver up to 256 KiB at once."""
 
 
 class Link:
@@ -27,8 +27,8 @@ class Link:
         name: for error messages.
         transmit: sends bytes to the peer.
         hang_up: closes the underlying transport; called once.
-        baud: baud rate of the line (bit/s); None where it has none.
-        limit: unread bytes kept.
+        baud: baud rate of the line (bit/s); None if it has none.
+        limit: maximum number of unread bytes.
     """
 
     def __init__(
@@ -50,14 +50,16 @@ class Link:
         self._due: float | None = None
         """Loop time at which the current wait times out."""
         self._alarm: asyncio.TimerHandle | None = None
-        """Rings at ``_due`` or earlier; outlives its wait, because the next one most likely needs it as well."""
+        """Timer that fires at ``_due`` or earlier; it outlives its wait, because the next wait most likely needs it as
+        well.
+        """
         self._rings = 0.0
-        """Loop time at which the alarm rings."""
+        """Loop time at which the timer fires."""
 
     # Interface to the transport
 
     def feed(self, data: bytes) -> None:
-        """Bytes arrived from the peer."""
+        """Store bytes received from the peer."""
         self._buffer += data
         if len(self._buffer) > self._limit:
             del self._buffer[: -self._limit]
@@ -65,7 +67,7 @@ class Link:
             self._waiting.on_bytes()
 
     def lose(self, why: str, error: type[DeviceLostError] = DeviceLostError) -> None:
-        """The transport is gone; pending and later reads raise ``error``."""
+        """Mark the transport as lost; pending and later reads raise ``error``."""
         self._hang_up = _nothing
         if self._lost is None:
             self._lost = error(f"{self.name}: {why}")
@@ -92,15 +94,15 @@ class Link:
         self._transmit(data)
 
     async def read(self, within: float | None = None, least: int = 1) -> bytes:
-        """Everything received so far.
+        """Return all bytes received so far.
 
         Args:
-            within: seconds to wait for it; None: no limit.
-            least: bytes worth waking for.
+            within: maximum wait (s); None: no limit.
+            least: minimum number of bytes to wait for.
 
         Raises:
             DeviceLostError: the link is down and its buffer holds less.
-            TimeoutError: not as much came in time.
+            TimeoutError: fewer bytes arrived in time.
         """
         if len(self._buffer) < least:
             due = _due(within)
@@ -111,15 +113,15 @@ class Link:
         return data
 
     async def exactly(self, count: int, within: float | None = None) -> bytes:
-        """Read ``count`` bytes; bytes beyond stay buffered.
+        """Read ``count`` bytes; further bytes stay buffered.
 
         Args:
-            count: how many.
-            within: seconds to wait for the last one; None: no limit.
+            count: number of bytes.
+            within: maximum wait for the last one (s); None: no limit.
 
         Raises:
-            DeviceLostError: the link went down before they came.
-            TimeoutError: they did not come in time; those that did stay buffered.
+            DeviceLostError: the link went down before they arrived.
+            TimeoutError: they did not arrive in time; those that did stay buffered.
         """
         if len(self._buffer) < count:
             due = _due(within)
@@ -130,10 +132,10 @@ class Link:
         return data
 
     def take(self, count: int) -> bytes | None:
-        """``count`` received bytes; None if there are not as many.
+        """Take ``count`` received bytes; None if fewer are buffered.
 
         Raises:
-            DeviceLostError: there are not as many, and the link is down.
+            DeviceLostError: fewer are buffered, and the link is down.
         """
         if len(self._buffer) < count:
             self._require_up()
@@ -149,7 +151,7 @@ class Link:
         return count
 
     def close(self) -> None:
-        """Hang up at once, dropping unsent bytes; may be called again."""
+        """Close the link at once and drop unsent bytes; may be called repeatedly."""
         if self._hang_up is not _nothing:
             hang_up, self._hang_up = self._hang_up, _nothing
             hang_up()
@@ -162,12 +164,12 @@ class Link:
         self.close()
 
     def begin_wait(self, waiting: "LinkWaiter", due: float | None) -> None:
-        """Wake ``waiting`` by the next bytes or the loss, or at ``due``, loop time, by a time-out.
+        """Wake ``waiting`` at the next bytes or the loss of the link, or by a timeout at ``due`` (loop time).
 
-        A time limit is one timer for many waits, set again only when it rings.
+        One timer serves many waits; it is set again only when it fires.
 
         Raises:
-            RuntimeError: a task waits already.
+            RuntimeError: a task is already waiting.
         """
         if self._waiting is not None:
             raise RuntimeError(f"{self.name}: a second reader: a link has only one")
@@ -180,7 +182,7 @@ class Link:
         self._waiting = self._due = None
 
     async def _more(self, due: float | None = None, count: int = 1) -> None:
-        """Wait until so many bytes are there, or no more will come."""
+        """Wait until ``count`` bytes are buffered or no more can arrive."""
         self._require_up()
         waiter = _Sleeper(lambda: len(self._buffer) >= count or self.is_lost)
         self.begin_wait(waiter, due)
@@ -202,7 +204,7 @@ class Link:
         self._alarm = None
         if self._due is None or self._waiting is None:
             return
-        timer_step = 0.001  # seconds; the loop's timers count in these, and ring up to one and a half too early
+        timer_step = 0.001  # seconds; resolution of the loop's timers, which fire up to one and a half of these early
         if self._due - loop.time() > timer_step / 2:
             self._set_alarm(loop, self._due)
         else:
@@ -213,10 +215,10 @@ class LinkWaiter(Protocol):
     """Waits for bytes of a link."""
 
     def on_bytes(self) -> None:
-        """Bytes came, or the link is lost."""
+        """Handle received bytes or the loss of the link."""
 
     def on_timeout(self) -> None:
-        """The wait has lasted too long."""
+        """Handle the timeout of the wait."""
 
 
 class _Sleeper:
@@ -248,12 +250,12 @@ def _due(within: float | None) -> float | None:
 
 
 class Port(Protocol):
-    """Somewhere a device may be plugged in."""
+    """Port that a device may be plugged into."""
 
     name: str
 
     async def open(self) -> Link:
-        """Open a fresh link.
+        """Open a new link.
 
         Raises:
             DeviceLostError: nothing is plugged in.

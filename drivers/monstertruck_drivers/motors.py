@@ -1,7 +1,7 @@
-"""Base of the drivers that command all shafts of one board, in one exchange a cycle.
+"""Base of the drivers that command all shafts of one board in one exchange per cycle.
 
-The shafts have one state together: the most careful of their commands counts, and the oldest. A stop is sent at once,
-everything else with the next cycle.
+The shafts share one state: the most cautious of their commands and the oldest one decide. A stop is sent at once, any
+other command with the next cycle.
 """
 
 from abc import ABC, abstractmethod
@@ -54,7 +54,7 @@ def requested(
         timeout: maximum age of a command (s); an older one stops the motors.
 
     Returns:
-        DISABLED, QUICK_STOP or ENABLED, and the commands there are: with ENABLED one for each shaft.
+        DISABLED, QUICK_STOP or ENABLED, and the existing commands: with ENABLED one for each shaft.
     """
     known = [command for command in commands if command is not None]
     if len(known) < len(commands) or any(command.action is DriveAction.DISABLE for command in known):
@@ -99,7 +99,7 @@ class MotorBoard(ABC, Generic[Settings, Session]):
         """State last requested from the board."""
 
     async def run(self, ready: Ready) -> None:
-        """Serve one session, from the stop of motors that may still turn to the stop at its end.
+        """Serve one session; it stops the motors at its start, as they may still turn, and at its end.
 
         Raises:
             DeviceLostError: nothing plugged in; the link went down.
@@ -134,12 +134,12 @@ class MotorBoard(ABC, Generic[Settings, Session]):
         return [commands.latest for commands in self._commands]
 
     def _is_urgent(self) -> bool:
-        """Whether a stop, or switching off the current, is still to be sent to the motors."""
+        """Whether a stop, or a switch-off of the current, still has to be sent to the motors."""
         wanted = self._wanted()
         return wanted is not DriveMode.ENABLED and wanted is not self._sent
 
     async def _until(self, due: int) -> None:
-        """Wait for the next cycle, or for a command that stops running motors; the last shaft's is the latest."""
+        """Wait for the next cycle, or for a command that stops running motors."""
         while (left := due - self._clock.now()) > 0:
             last = self._commands[-1]
             if await last.next_within(left / SECOND, lambda _: not self._is_urgent()) is None or self._is_urgent():
@@ -147,7 +147,7 @@ class MotorBoard(ABC, Generic[Settings, Session]):
 
     @abstractmethod
     def _session(self, link: Link) -> Session:
-        """Make the session of an open link."""
+        """Create the session of an open link."""
 
     @abstractmethod
     async def _start(self, session: Session) -> None:
@@ -155,7 +155,7 @@ class MotorBoard(ABC, Generic[Settings, Session]):
 
     @abstractmethod
     def _wanted(self) -> DriveMode:
-        """Return the state that the latest commands ask for."""
+        """Return the state requested by the latest commands."""
 
     @abstractmethod
     async def _exchange(self, session: Session) -> None:
@@ -163,4 +163,4 @@ class MotorBoard(ABC, Generic[Settings, Session]):
 
     @abstractmethod
     async def _make_safe(self, session: Session) -> None:
-        """Stop the motors at the end of a session; raises nothing but cancellation."""
+        """Stop the motors at the end of a session; raises only on cancellation."""

@@ -1,4 +1,4 @@
-"""Settings of servos and speed controllers that pulses control, on any controller."""
+"""Settings of pulse-controlled servos and speed controllers, for any controller."""
 
 import math
 from typing import Annotated, Literal, Self
@@ -16,15 +16,15 @@ class ServoPulses(Schema):
     centre_us: Microseconds = 1439.2
     """Pulse that steers straight ahead."""
     scale_us_per_deg: Annotated[float, Field(gt=0)] = 10.48
-    """Change of the pulse for each degree of servo angle (us)."""
+    """Change of the pulse per degree of servo angle (us)."""
     direction: Literal[-1, 1] = -1
-    """+1 where a longer pulse steers left, -1 where it steers right; a matter of how the servo is mounted."""
+    """+1 if a longer pulse steers left, -1 if it steers right; depends on the servo's mounting."""
     min_us: Microseconds = 1088.0
-    """Shortest pulse commanded (us)."""
+    """Minimum commanded pulse (us)."""
     max_us: Microseconds = 1840.0
-    """Longest pulse commanded (us)."""
+    """Maximum commanded pulse (us)."""
     max_angle_deg: Annotated[float, Field(gt=0, le=180)] = 45.0
-    """Largest servo angle commanded to either side (degrees)."""
+    """Maximum commanded servo angle to either side (degrees)."""
 
     @model_validator(mode="after")
     def _centre_within_limits(self) -> Self:
@@ -33,7 +33,7 @@ class ServoPulses(Schema):
         return self
 
     def pulse_us(self, angle: float) -> float:
-        """Pulse (us) for a servo angle (rad, left positive), held within all limits."""
+        """Pulse (us) for a servo angle (rad, left positive), clamped to all limits."""
         limit = self.max_angle_deg
         degrees = min(max(math.degrees(angle), -limit), limit)
         pulse = self.centre_us + self.direction * self.scale_us_per_deg * degrees
@@ -45,7 +45,7 @@ class ServoPulses(Schema):
 
     @property
     def reach(self) -> tuple[float, float]:
-        """Servo angles, rad, to the right (negative) and to the left, that pulses within all limits give."""
+        """Servo angles (rad) at the pulse limits: to the right (negative) and to the left."""
         ends = sorted(self.angle_of(pulse) for pulse in (self.min_us, self.max_us))
         limit = math.radians(self.max_angle_deg)
         return max(ends[0], -limit), min(ends[1], limit)
@@ -54,29 +54,30 @@ class ServoPulses(Schema):
 class EscPulses(Schema):
     """Speed controller without feedback: ``pulse_us = neutral_us + direction * reach_us * rate / max_rate``.
 
-    It must reverse without braking first (crawler mode); a car's usual mode takes the first reverse pulse for a brake.
+    It must reverse without braking first (crawler mode); the usual mode of a car treats the first reverse pulse as a
+    brake.
     """
 
     neutral_us: Microseconds = 1500.0
-    """Pulse at which the motor stands still"""
+    """Pulse at which the motor is at rest"""
     reach_us: Annotated[float, Field(gt=0, le=1000)] = 400.0
     """Change of the pulse that makes the motor turn at max_rate"""
     direction: Literal[-1, 1] = 1
-    """+1 where a longer pulse drives forward"""
+    """+1 if a longer pulse drives forward"""
     max_rate: Annotated[float, Field(gt=0, le=10_000)] = 300.0
-    """Rate at the end of the pulses, as measured (rad/s); requests are limited to this"""
+    """Measured rate at the maximum pulse (rad/s); it limits requests"""
     deceleration: Annotated[float, Field(gt=0)] = 400.0
-    """Deceleration by a lower pulse, as measured (rad/s^2)"""
+    """Measured deceleration at a lower pulse (rad/s^2)"""
     quick_deceleration: Annotated[float, Field(gt=0)] = 500.0
-    """Deceleration at the neutral pulse, as measured (rad/s^2)"""
+    """Measured deceleration at the neutral pulse (rad/s^2)"""
     arming: Annotated[float, Field(ge=0, le=10)] = 2.0
-    """Seconds of neutral pulses that it wants before it moves"""
+    """Duration of neutral pulses that the controller requires before it moves (s)"""
 
     def pulse_us(self, rate: float) -> float:
-        """Pulse (us) for a rate, rad/s, forward positive, held within the limits."""
+        """Pulse (us) for a rate (rad/s), forward positive, clamped to the limits."""
         share = min(max(rate / self.max_rate, -1.0), 1.0)
         return self.neutral_us + self.direction * self.reach_us * share
 
     def rate(self, pulse_us: float) -> float:
-        """Rate that a pulse asks for, rad/s, forward positive."""
+        """Rate commanded by a pulse (rad/s), forward positive."""
         return (pulse_us - self.neutral_us) * self.direction / self.reach_us * self.max_rate

@@ -24,8 +24,9 @@ class SteeringOutputs(NamedTuple):
     """Steering outputs of a controller; ``steering_outputs`` of its settings."""
 
     reaches: tuple[tuple[float, float], ...]
-    """For every servo of a ``SteeringCommand``, in its order: servo angles, rad, to the right (negative) and to the
-    left. Both are 0 where the controller has no output for it."""
+    """Maximum angles of every servo, in the order of ``SteeringCommand`` (rad): to the right (negative) and to the
+    left. Both are 0 if the controller has no output for it.
+    """
     dead_time: float | None
     """Dead time from a command to the first movement of the wheels (s); None: not measured."""
     lag: float | None
@@ -33,7 +34,7 @@ class SteeringOutputs(NamedTuple):
 
     @property
     def axles(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Reach of the front and of the rear axle; where every wheel has a servo, of the left ones."""
+        """Reach of the front and the rear axle; of their left servos if every wheel has a servo."""
         return self.reaches[0], self.reaches[len(self.reaches) // 2]
 
 

@@ -1,7 +1,7 @@
-"""Signals of an emulated device: the values it reports, the orders it obeys, and the faults that falsify them.
+"""Signals of an emulated device: the values it reports, the commands it executes, and the faults that falsify them.
 
 An emulator names its signals once and passes each value through ``report`` or ``order``; every fault of this module
-then applies to every signal. Tests and drills derive their families of faults from ``Signals.faults``.
+then applies to every signal. Tests and drills derive their fault families from ``Signals.faults``.
 """
 
 import asyncio
@@ -22,7 +22,7 @@ R = TypeVar("R")
 
 
 class SignalKind(StrEnum):
-    """Content of a signal."""
+    """Kind of a signal."""
 
     NUMBER = "number"
     ARRAY = "array"
@@ -56,7 +56,7 @@ class Context:
 
 
 LOST: Final = object()
-"""Result of a distortion of a command that is not obeyed."""
+"""Result of a distortion of a command that is not executed."""
 
 Distortion = Callable[[Any, int], Any]
 """Falsifies a value: (true value, time in ns) to the value that is used, or ``LOST``."""
@@ -151,7 +151,7 @@ def _swapped(context: Context) -> Distortion:
 
 
 def _sparing(distort: Distortion, least: float) -> Distortion:
-    """Leave the values of an array below ``least``, which are codes, as they are."""
+    """Apply a distortion only to array values of at least ``least``: lower values are codes."""
 
     def spare(value: Any, now: int) -> Any:
         shown = np.array(distort(value, now))
@@ -192,7 +192,7 @@ def _growing(context: Context) -> Distortion:
 
 @dataclass(frozen=True, slots=True)
 class _Later:
-    """A command that is obeyed later."""
+    """Command that is executed later."""
 
     seconds: float
 
@@ -234,8 +234,9 @@ FAULTS: Final[Mapping[str, SignalFault]] = {
     "lost": SignalFault(_lost, COMMANDS, "SHARE"),
     "growing": SignalFault(_growing, frozenset({SignalKind.ORDER})),
 }
-"""Every fault of a signal by name; arguments are in the signal's unit. ``growing`` obeys an order only if its magnitude
-is not below the previous order's magnitude."""
+"""Every fault of a signal by name; arguments are in the signal's unit. ``growing`` executes a command only if its
+magnitude is not below that of the previous command.
+"""
 
 
 HELP: Final = "of its signals: signal NAME off|" + "|".join(
@@ -254,7 +255,7 @@ class Signals:
             change.
 
     Raises:
-        InputError: a kind is no ``SignalKind``.
+        InputError: a kind is not a ``SignalKind``.
     """
 
     def __init__(
@@ -279,7 +280,7 @@ class Signals:
         """Execution time of a signal's latest delayed command (ns); later commands never overtake it."""
 
     def faults(self) -> Iterator[tuple[str, str]]:
-        """Yield every (signal, fault) that ``inject`` accepts; ``swapped`` only where there is a neighbour."""
+        """Yield every (signal, fault) that ``inject`` accepts; ``swapped`` only for signals with a neighbour."""
         for name, kind in self.kinds.items():
             for fault, what in FAULTS.items():
                 if kind in what.kinds and (fault != "swapped" or self._neighbour(name) is not None):
@@ -329,7 +330,7 @@ class Signals:
         return shown
 
     def order(self, name: str, value: T, obey: Callable[[T], R]) -> R | None:
-        """Obey a command with ``value`` as changed by the signal's faults.
+        """Execute a command with ``value`` as falsified by the signal's faults.
 
         Returns:
             The result of ``obey``; None if it is called later or never.

@@ -1,4 +1,4 @@
-"""Listening to a device that sends without being asked."""
+"""Receives from a device that streams without requests."""
 
 from collections.abc import Callable
 from typing import Generic, TypeVar
@@ -16,8 +16,8 @@ class DeviceStream(Generic[T]):
     Args:
         link: open link.
         clock: time.
-        parse: takes the bytes that came, however they are cut, and returns the messages that became complete.
-        batch: number of bytes worth waking up for.
+        parse: takes the received bytes, in chunks of any size, and returns the completed messages.
+        batch: number of bytes that justify a wake-up.
     """
 
     def __init__(self, link: Link, clock: Clock, parse: Callable[[bytes], list[T]], batch: int = 1) -> None:
@@ -30,10 +30,10 @@ class DeviceStream(Generic[T]):
         self._batch = batch
 
     async def next(self, within: float | None = None) -> list[T]:
-        """Return the messages that became complete with the next bytes, perhaps none.
+        """Return the messages completed by the next bytes, possibly none.
 
         Args:
-            within: seconds to wait for the bytes; None: no limit.
+            within: maximum wait for the bytes (s); None: no limit.
 
         Raises:
             DeviceLostError: unplugged.
@@ -48,10 +48,10 @@ class DeviceStream(Generic[T]):
         return self._parse(data)
 
     async def receive(self, within: float) -> list[T]:
-        """Return the messages that became complete, at least one.
+        """Return the completed messages, at least one.
 
         Args:
-            within: seconds to wait for one.
+            within: maximum wait for a message (s).
 
         Raises:
             DeviceLostError: unplugged.
@@ -77,8 +77,8 @@ class DeviceStream(Generic[T]):
         """Return the first messages of a session.
 
         Args:
-            within: seconds to wait for one.
-            expected: end of the message of a ``WrongDeviceError``: the expected device, and likely causes.
+            within: maximum wait for a message (s).
+            expected: end of the text of a ``WrongDeviceError``: the expected device and likely causes.
 
         Raises:
             DeviceLostError: unplugged.

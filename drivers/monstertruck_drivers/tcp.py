@@ -10,17 +10,17 @@ from monstertruck_drivers.link import STREAM_LIMIT, Link
 from monstertruck_runtime.errors import DeviceLostError
 
 CONNECT_TIMEOUT: Final = 2.0
-"""Seconds within which a device must accept the connection."""
+"""Maximum time for a device to accept the connection (s)."""
 
 
 def parse_address(text: str) -> tuple[str, int] | None:
-    """Address and TCP port of ``192.168.0.10:10940``; None if the text is none."""
+    """Parse address and TCP port of ``192.168.0.10:10940``; None if the text is not an address."""
     found = re.fullmatch(r"(\d{1,3}(?:\.\d{1,3}){3}):(\d{1,5})", text)
     return None if found is None else (found[1], int(found[2]))
 
 
 class TcpPort:
-    """A socket by its address. Nothing of it blocks: an address needs no name server.
+    """A socket by its IPv4 address, which needs no name look-up, so that nothing blocks.
 
     Args:
         address: IPv4 address.
@@ -55,14 +55,14 @@ class _TcpProtocol(asyncio.Protocol):
     """Feeds a ``Link`` from a connection.
 
     Args:
-        name: for error messages.
+        name: name for error messages.
     """
 
     def __init__(self, name: str) -> None:
         self._name = name
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Connected."""
+        """Store the transport."""
         line: socket.socket = transport.get_extra_info("socket")
         # Age at which unacknowledged bytes end the connection (s): more than two retransmissions on a local network.
         line.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(0.5 * 1000))
@@ -70,11 +70,11 @@ class _TcpProtocol(asyncio.Protocol):
         self.link = Link(self._name, stream.write, stream.abort, limit=STREAM_LIMIT)
 
     def data_received(self, data: bytes) -> None:
-        """Bytes came."""
+        """Pass received bytes to the link."""
         self.link.feed(data)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """The connection is gone."""
+        """Report the loss of the connection."""
         self.link.lose(
             f"connection lost ({_why(exc)})" if isinstance(exc, OSError) else "the device closed the connection"
         )

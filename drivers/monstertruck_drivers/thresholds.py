@@ -1,4 +1,4 @@
-"""Thresholds with hysteresis and dwell: conditions that must hold for a time, levels that are left only by a margin."""
+"""Thresholds with hysteresis and dwell time, for conditions that must last and levels that need a margin to end."""
 
 from dataclasses import dataclass
 
@@ -6,14 +6,14 @@ from monstertruck_runtime.clock import SECOND
 
 
 class Dwell:
-    """True once a condition has held without a break for some seconds."""
+    """Becomes True when a condition has held for some seconds without a break."""
 
     def __init__(self, seconds: float) -> None:
         self._needed = round(seconds * SECOND)
         self._since: int | None = None
 
     def update(self, time_ns: int, condition: bool) -> bool:
-        """Take the condition at ``time_ns``; whether it has held long enough."""
+        """Process the condition at ``time_ns``; return whether it has held long enough."""
         if not condition:
             self._since = None
             return False
@@ -24,12 +24,12 @@ class Dwell:
 
 @dataclass(frozen=True, slots=True)
 class Threshold:
-    """Limits that set and clear an alarm; ``clear < set`` watches for too much, ``clear > set`` for too little."""
+    """Limits of an alarm; ``clear < set`` detects values that are too high, ``clear > set`` values that are too low."""
 
     set: float
     clear: float
     after: float = 0.0
-    """Seconds beyond ``set`` before it begins."""
+    """Time beyond ``set`` before the alarm begins (s)."""
 
 
 class ThresholdAlarm:
@@ -45,7 +45,7 @@ class ThresholdAlarm:
         self.active = False
 
     def update(self, time_ns: int, value: float | None) -> bool:
-        """Take the value at ``time_ns``; without a value nothing changes. Returns whether the alarm changed."""
+        """Process the value at ``time_ns``; None changes nothing. Return whether the alarm changed."""
         if value is None:
             return False
         limits = self._threshold

@@ -1,6 +1,6 @@
 """Transactions over a link that resume in the callback that delivers the next bytes.
 
-In a byte-by-byte handshake, a coroutine costs one task wake-up per byte; here the bytes go straight to a generator.
+In a byte-by-byte handshake, a coroutine needs one task wake-up per byte; here a generator receives the bytes directly.
 """
 
 import asyncio
@@ -15,20 +15,20 @@ from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, Pro
 T = TypeVar("T")
 
 MISSES: Final = 3
-"""Consecutive exchanges without a usable answer that end a session, unless a driver sets another number."""
+"""Default number of consecutive exchanges without a usable answer after which a session ends."""
 
 
 class Misses:
-    """Context of one exchange after the other: suppresses errors of the answer, but not of the last of ``limit``.
+    """Context for consecutive exchanges: suppresses errors of the answer, except the last of ``limit`` in a row.
 
     Args:
-        limit: exchanges in a row without a usable answer that end a session.
+        limit: consecutive exchanges without a usable answer after which the session ends.
     """
 
     def __init__(self, limit: int = MISSES) -> None:
         self._limit = limit
         self.count = 0
-        """Failed exchanges in a row; 0 after one that succeeded."""
+        """Number of consecutive failed exchanges."""
 
     def __enter__(self) -> None:
         pass
@@ -53,7 +53,7 @@ Steps = Generator[WaitFor, bytes, T]
 
 
 class Transaction(Generic[T]):
-    """One transaction, started at once and run to its end whether or not a task waits for it.
+    """One transaction; it starts at once and runs to its end, whether or not a task waits for it.
 
     Args:
         link: link whose only reader is this transaction until it ends.
@@ -76,7 +76,7 @@ class Transaction(Generic[T]):
         """Wait for the end; a cancelled wait does not end the transaction.
 
         Raises:
-            Exception: what the transaction raised.
+            Exception: exception raised by the transaction.
         """
         await self.end()
         if self._error is not None:
@@ -84,14 +84,14 @@ class Transaction(Generic[T]):
         return self._value  # type: ignore[return-value]  # set, as there was no error
 
     async def end(self) -> None:
-        """Wait for the end, whatever it is."""
+        """Wait for the end and ignore the result."""
         if not self.ended:
             waiter = self._loop.create_future()
             self._waiters.append(waiter)
             await waiter
 
     def cancel(self) -> None:
-        """Break it off."""
+        """Cancel the transaction."""
         if not self.ended:
             self._link.end_wait()
             try:
@@ -127,7 +127,7 @@ class Transaction(Generic[T]):
 
     @contextmanager
     def _ending_by_any_error(self) -> Iterator[None]:
-        """End with an error outside ``Exception``, which a signal may raise anywhere: waiting tasks must not hang."""
+        """End on an exception outside ``Exception``, which a signal may raise anywhere: waiting tasks must not hang."""
         try:
             yield
         except BaseException as error:

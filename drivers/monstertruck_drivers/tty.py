@@ -1,7 +1,7 @@
 """Serial ports of the kernel, opened and closed in separate threads.
 
-Both may wait for the device: opening makes several USB transfers of up to 5 s each if the device does not answer;
-closing waits 30 s for a device that takes no bytes. Only reading and writing run on the event loop.
+Both may block on the device: opening makes several USB transfers, each of up to 5 s if the device does not answer;
+closing waits 30 s for a device that accepts no bytes. Only reading and writing run on the event loop.
 """
 
 import asyncio
@@ -28,17 +28,18 @@ from monstertruck_runtime.errors import DeviceLostError, DeviceWedgedError, Port
 from monstertruck_runtime.open_files import holders
 
 PATIENCE: Final = 2.0
-"""Time limit for the kernel to open or close a port (s); a slower port is reported as wedged."""
+"""Time limit for the kernel to open or close a port (s); then the port is reported as wedged."""
 MAX_AGE: Final = 0.25
-"""Time without progress after which unsent bytes are outdated and their device is wedged (s): longer than a hub takes
-to resume, about as long as the gate drives without feedback."""
+"""Time without progress after which unsent bytes are outdated and their device is wedged (s): longer than the resume
+time of a hub, and about as long as the gate drives without feedback.
+"""
 
 _PTY_MAJORS: Final = range(136, 144)
 """Device numbers of pseudo terminals."""
 
 
 class OpenSerial(Protocol):
-    """Makes a port of a serial node: ``SerialPort``, or an emulated computer's own."""
+    """Factory of the port of a serial node: ``SerialPort``, or that of an emulated computer."""
 
     def __call__(
         self,
@@ -61,8 +62,8 @@ class SerialPort:
         baud: bits per second; meaningless on USB-CDC and ptys.
         dtr: level of the line DTR while the port is open; the kernel itself raises both lines for a moment on opening.
         rts: level of the line RTS while the port is open.
-        low_latency: ask the adapter's driver not to gather bytes.
-        framing: bits of a byte.
+        low_latency: ask the adapter's driver not to collect bytes.
+        framing: format of a byte.
     """
 
     def __init__(
@@ -80,7 +81,7 @@ class SerialPort:
         self._make = partial(_Tty, str(path), baud, dtr=dtr, rts=rts, low_latency=low_latency, framing=framing)
 
     async def open(self) -> Link:
-        """Open raw and exclusive, with empty buffers; waits for a link of this process that is being closed.
+        """Open the port raw and exclusive, with empty buffers; wait for a link of this process that is closing.
 
         Raises:
             DeviceLostError: the node does not exist or vanished.
@@ -94,7 +95,7 @@ class SerialPort:
         return _SerialProtocol(self.name, tty).link
 
     def _open(self, node: "_PortNode") -> "_Tty":
-        """Open here, in a thread; raises as ``open``."""
+        """Open the port in this thread; raises the errors of ``open``."""
         try:
             return self._make(node=node)
         except serial.SerialException as error:
@@ -115,13 +116,13 @@ class SerialPort:
 
 
 _closing: set[Future[None]] = set()
-"""Work of the threads that close ports."""
+"""Futures of the threads that close ports."""
 
 
 @atexit.register
 def _await_last_words() -> None:
     """Let closing ports send their last bytes. The end of the process kills the threads of wedged ports."""
-    # Seconds that the end of the program waits for ports to close: a closing port sends its last bytes.
+    # Maximum wait for ports to close at the end of the program (s): a closing port sends its last bytes.
     last_words = 1.0
     futures.wait(_closing, last_words)
 
@@ -136,10 +137,10 @@ class _PortNode:
     def __init__(self) -> None:
         self._work: list[Future[None]] = []
         self._overdue: Future[None] | None = None
-        """Work that did not end in time."""
+        """Work that has exceeded its time limit."""
 
     async def open(self, name: str, make: "Callable[[], _Tty]") -> "_Tty":
-        """Run ``make`` in a thread; a tty made too late, or for a cancelled caller, is closed there.
+        """Run ``make`` in a thread, which also closes a tty that is too late or whose caller was cancelled.
 
         Args:
             name: name of the port, for error messages.
@@ -147,7 +148,7 @@ class _PortNode:
 
         Raises:
             DeviceWedgedError: it has not returned after ``PATIENCE``, or earlier work of this node has not ended.
-            Exception: what ``make`` raised.
+            Exception: exception raised by ``make``.
         """
         await self._previous_work(name)
         outcome: Future[_Tty] = Future()
@@ -197,7 +198,7 @@ class _PortNode:
 
 
 _nodes: WeakValueDictionary[str, _PortNode] = WeakValueDictionary()
-"""Nodes that are in use, by their real path."""
+"""Nodes in use, by their real path."""
 
 
 def _node(path: Path) -> _PortNode:
@@ -209,7 +210,7 @@ def _node(path: Path) -> _PortNode:
 
 
 def _start(work: Callable[[], None], ended: Future[None]) -> None:
-    """Do blocking work in a thread that nothing waits for unless it wants to."""
+    """Do blocking work in a thread that the end of the process does not wait for."""
 
     def run() -> None:
         try:
@@ -235,12 +236,12 @@ async def _ended(work: "Future[Any]", seconds: float) -> None:
 
 
 class _Tty(serial.Serial):
-    """Pyserial's port, which is closed in a thread and never drained. To be made in a thread.
+    """Pyserial's port, which is closed in a thread and never drained. Must be created in a thread.
 
     Args:
         path: device node.
         baud: see ``SerialPort``.
-        node: its work.
+        node: device node with its pending work.
         dtr: see ``SerialPort``.
         rts: see ``SerialPort``.
         low_latency: see ``SerialPort``.
@@ -268,7 +269,7 @@ class _Tty(serial.Serial):
             raise
 
     def _take_over(self, *, low_latency: bool) -> None:
-        # A pty keeps the mark as long as the other side has it open, and would refuse the next daemon.
+        # A pty keeps the exclusive flag while its other side is open, and would refuse the next daemon.
         if os.major(os.fstat(self.fileno()).st_rdev) not in _PTY_MAJORS:
             fcntl.ioctl(self.fileno(), termios.TIOCEXCL)
         with contextlib.suppress(OSError, termios.error):
@@ -278,18 +279,18 @@ class _Tty(serial.Serial):
                 self.set_low_latency_mode(True)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Skip a time-out that is set once more: pyserial would configure the open port again, by USB transfers."""
+        """Skip a timeout that is already set: pyserial would configure the open port again, by USB transfers."""
         if not (name in ("timeout", "write_timeout") and self.is_open and value == getattr(self, name)):
             super().__setattr__(name, value)
 
     def write(self, data: Any) -> int:
-        """Write once; pyserial's own ``write`` repeats it as long as nothing fits, which stops the event loop.
+        """Write once; pyserial's own ``write`` repeats until the bytes fit, which blocks the event loop.
 
         Returns:
-            Bytes that fitted.
+            Number of bytes written.
 
         Raises:
-            BlockingIOError: none did.
+            BlockingIOError: no byte was written.
             serial.SerialException: the port is gone.
         """
         try:
@@ -300,14 +301,14 @@ class _Tty(serial.Serial):
             raise serial.SerialException(error.errno, error.strerror) from error
 
     def untaken(self) -> int:
-        """Bytes that the kernel still has for the device."""
+        """Number of bytes that the kernel still holds for the device."""
         try:
             return self.out_waiting
         except OSError:  # unplugged
             return 0
 
     def flush(self) -> None:
-        """Do not drain: that waits for the device, without limit."""
+        """Do nothing: pyserial would wait for the device without a limit."""
 
     def begin_closing(self) -> None:
         """Make later opens of the node wait until this port is closed."""
@@ -317,7 +318,7 @@ class _Tty(serial.Serial):
             self._ending.add_done_callback(_closing.discard)
 
     def close(self) -> None:
-        """Close in a thread; may be called again."""
+        """Close the port in a thread; may be called repeatedly."""
         if self.is_open and not self._is_handed_over:
             self._is_handed_over = True
             self.begin_closing()
@@ -325,7 +326,7 @@ class _Tty(serial.Serial):
             _start(self.release, self._ending)
 
     def release(self) -> None:
-        """Close here; waits for the device as long as the kernel does."""
+        """Close the port in this thread; waits for the device as long as the kernel does."""
         with contextlib.suppress(OSError):
             fcntl.ioctl(self.fileno(), termios.TIOCNXCL)
         super().close()
@@ -335,8 +336,8 @@ class _SerialProtocol(asyncio.Protocol):
     """Feeds a ``Link`` from a pyserial-asyncio transport.
 
     Args:
-        name: for error messages.
-        tty: open and exclusive; closed with the link.
+        name: name for error messages.
+        tty: open, exclusive port; closed with the link.
     """
 
     def __init__(self, name: str, tty: _Tty) -> None:
@@ -344,16 +345,16 @@ class _SerialProtocol(asyncio.Protocol):
         self._loop = asyncio.get_running_loop()
         self._transport = serial_asyncio.SerialTransport(self._loop, self, tty)
         self._moved = 0.0
-        """Loop time at which the device last took bytes."""
+        """Loop time at which the device last accepted bytes."""
         self._untaken = 0
-        """Bytes that the kernel had for the device after the last write."""
+        """Bytes that the kernel held for the device after the last write."""
         self._full_since = 0.0
-        """Loop time since which the kernel has had no room for all bytes; counts while the transport has some."""
+        """Loop time since which the kernel has had no room for all bytes; valid while the transport holds some."""
         self._alarm: asyncio.TimerHandle | None = None
         self.link = Link(name, self._send, self._hang_up, tty.baudrate)
 
     def _send(self, data: bytes) -> None:
-        """Write at once: a last command before ``close`` must not wait in a buffer that ``abort`` drops."""
+        """Write at once: a last command before ``close`` must not remain in a buffer that ``abort`` drops."""
         if self._transport.is_closing():
             return
         now, untaken = self._loop.time(), self._tty.untaken()
@@ -365,9 +366,9 @@ class _SerialProtocol(asyncio.Protocol):
         if self._transport.get_write_buffer_size() == 0:
             try:
                 data = data[self._tty.write(data) :]
-            except BlockingIOError:  # not one byte fits
+            except BlockingIOError:  # no byte fits
                 pass
-            except OSError as error:  # the transport would call it a fatal error of ours
+            except OSError as error:  # the transport would log it as a fatal error
                 self.link.lose(f"unplugged ({error.strerror})")
                 self._hang_up()
                 return
@@ -379,7 +380,7 @@ class _SerialProtocol(asyncio.Protocol):
         self._untaken = self._tty.untaken()
 
     def _check_age(self) -> None:
-        """Give up the device if its line has been full for too long.
+        """Close the port if its line has been full for too long.
 
         This also applies after a read error, when the transport tries to send its remaining bytes before it ends.
         """
@@ -393,23 +394,23 @@ class _SerialProtocol(asyncio.Protocol):
             self._give_up()
 
     def _give_up(self) -> None:
-        """Drop the outdated bytes of a device that takes none."""
+        """Drop the outdated bytes of a device that accepts none, and report its loss."""
         self.link.lose(f"its device has accepted no bytes for {MAX_AGE:g} s", DeviceWedgedError)
         self._hang_up()
 
     def _hang_up(self) -> None:
-        """Close without delay; ``close`` of the transport, with a stalled peer, never ends."""
+        """Close without delay; the transport's ``close`` never ends if the peer is stalled."""
         if self._alarm is not None:
             self._alarm.cancel()
         self._tty.begin_closing()
         self._transport.abort()
 
     def data_received(self, data: bytes) -> None:
-        """Bytes came."""
+        """Pass received bytes to the link."""
         self.link.feed(data)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """The port is gone."""
-        # An error without a number is pyserial's own guess at why there is nothing to read: the cable is out.
+        """Report the loss of the port."""
+        # Pyserial raises an error without a number if there is nothing to read: the cable is unplugged.
         number = exc.errno if isinstance(exc, OSError) else None
         self.link.lose("unplugged" if number is None else f"unplugged ({os.strerror(number)})")

@@ -1,1 +1,1 @@
-"""The far side of the cables: a simulated world, and an emulated robot and computer in it."""
+"""Simulated world, with an emulated robot and computer in it, behind the cables."""

@@ -1,4 +1,4 @@
-"""The emulated computer of a simulated truck: hubs, ports and nodes as its configuration names them."""
+"""Emulated computer of a simulated truck: hubs, ports and nodes with the names in its configuration."""
 
 import asyncio
 from collections.abc import Iterable, Mapping
@@ -16,18 +16,18 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
 
 OTHER = UsbIdentity("1a86:7523", "USB Serial", "ttyUSB")
-"""A device whose kind declares no USB identity is connected to an adapter."""
+"""Adapter of a device whose kind declares no USB identity."""
 DISK = Disk(total=64_000_000_000, free=32_000_000_000)
-"""Disk of an emulated computer; on the real one, every run would record something else."""
+"""Disk of an emulated computer: with the real disk, logs would differ between runs."""
 HELP = "known: lose HUB, return HUB, over-current PLACE, suspend PLACE; places as in 1-1.2"
 
 
 class UsbCable:
-    """``EmulatedPort`` of a device in the emulated tree: pulling the cable takes the device out of it.
+    """``EmulatedPort`` of a device in the emulated tree: unplugging the cable removes the device from the tree.
 
     Args:
         usb: the tree.
-        where: kernel's name of the device's place.
+        where: kernel name of the device's place.
         cable: cable behind its node.
     """
 
@@ -39,7 +39,7 @@ class UsbCable:
 
     @property
     def device(self) -> DeviceEnd:
-        """The device's side of the cable."""
+        """Device side of the cable."""
         return self._cable.device
 
     @device.setter
@@ -47,16 +47,16 @@ class UsbCable:
         self._cable.device = end
 
     def plug(self) -> None:
-        """Plug the device in; it shows as soon as its hub does."""
+        """Plug the device in; it appears once its hub is present."""
         self._usb.plug(self._where)
 
     def unplug(self) -> None:
-        """Pull the cable out of the hub."""
+        """Unplug the cable from the hub."""
         self._usb.unplug(self._where)
 
 
 def _buses(ports: Iterable[AnyPort]) -> dict[str, int]:
-    """Numbers of buses that no kernel's name uses, by the controllers of names by topology."""
+    """Choose bus numbers that no kernel name uses, for the controllers in names by topology."""
     hubs = [port.hub for port in ports if isinstance(port, UsbPortConfig)]
     controllers = sorted({hub.rpartition("-usb-0:")[0] for hub in hubs if is_topology(hub)})
     taken = {sort_key(hub)[0] for hub in hubs if not is_topology(hub)}
@@ -64,7 +64,7 @@ def _buses(ports: Iterable[AnyPort]) -> dict[str, int]:
 
 
 def _by_kernel(port: UsbPortConfig, buses: Mapping[str, int]) -> UsbPortConfig:
-    """A port by the names that the emulated kernel gives."""
+    """Convert a port to the names of the emulated kernel."""
     if not is_topology(port.hub):
         return port
     controller, _, ports = port.hub.rpartition("-usb-0:")
@@ -73,10 +73,10 @@ def _by_kernel(port: UsbPortConfig, buses: Mapping[str, int]) -> UsbPortConfig:
 
 
 class EmulatedComputer:
-    """The USB tree of every device that hangs by hub and port.
+    """USB tree with every device that is configured by hub and port.
 
     Args:
-        folder: gets proc, sys and dev; must exist.
+        folder: existing folder that receives proc, sys and dev.
         devices: devices of the truck.
         cables: devices emulated on the cables, by role.
         clock: time.
@@ -88,7 +88,7 @@ class EmulatedComputer:
         self._returning: asyncio.Task[None] | None = None
         self.usb = EmulatedUsb(folder)
         self.ports: dict[str, EmulatedPort] = dict(cables)
-        """Cables that are plugged and pulled, by role."""
+        """Cables by role."""
         buses = _buses(device.port for device in devices.present().values())
         self.usb.controllers |= {bus: controller.partition("-")[2] for controller, bus in buses.items()}
         places = {
@@ -113,14 +113,14 @@ class EmulatedComputer:
             self.ports[role] = UsbCable(self.usb, port.device, cables[role])
 
     def computer(self) -> Computer:
-        """Computer that a daemon in this process uses."""
+        """Computer for a daemon in this process."""
         return Computer(self.usb.machine(self._clock), self.folder, lambda: self.usb.watcher, lambda _: DISK)
 
     def command(self, words: list[str]) -> None:
-        """Execute one word on the USB tree, see ``HELP``; a hub that returns takes its time.
+        """Execute a command on the USB tree, see ``HELP``; the return of a hub takes some time.
 
         Raises:
-            InputError: it is not understood, or there is no such place.
+            InputError: the command or the place is unknown.
         """
         try:
             match words:
@@ -139,5 +139,5 @@ class EmulatedComputer:
 
 
 def hangs_by_hub(devices: Devices) -> bool:
-    """Whether any device is named by hub and port."""
+    """Whether any device is configured by hub and port."""
     return any(isinstance(device.port, UsbPortConfig) for device in devices.present().values())

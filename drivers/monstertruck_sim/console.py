@@ -22,13 +22,13 @@ CABLE = (
 
 
 class Commanded(Protocol):
-    """Something that takes commands."""
+    """Target of console commands."""
 
     def command(self, words: list[str]) -> None:
-        """Carry out one command.
+        """Execute one command.
 
         Raises:
-            InputError: it is unknown; the text lists the known ones.
+            InputError: the command is unknown; the text lists the known ones.
         """
 
 
@@ -40,10 +40,10 @@ class Emulated:
     port: EmulatedPort
 
     def command(self, words: list[str]) -> None:
-        """Carry out one command.
+        """Execute one command.
 
         Raises:
-            InputError: it is unknown; the text lists the known ones.
+            InputError: the command is unknown; the text lists the known ones.
         """
         match words:
             case ["plug"]:
@@ -68,15 +68,15 @@ class Emulated:
 
 @dataclass(frozen=True, slots=True)
 class EmulatedFiles:
-    """A part of the emulated computer; its only commands are its faults."""
+    """Part of the emulated computer; its only commands are its faults."""
 
     emulator: FileEmulator
 
     def command(self, words: list[str]) -> None:
-        """Carry out one command.
+        """Execute one command.
 
         Raises:
-            InputError: it is unknown; the text lists the known ones.
+            InputError: the command is unknown; the text lists the known ones.
         """
         match words or ["help"]:
             case ["signal", *rest]:
@@ -89,7 +89,7 @@ def set_signal_fault(emulator: object, words: list[str]) -> None:
     """Falsify a signal of an emulator from the words NAME FAULT [VALUE].
 
     Raises:
-        InputError: the emulator names no signals, or the words name none of them or no fault.
+        InputError: the emulator declares no signals, or the signal or fault is unknown.
     """
     signals = signals_of(emulator)
     if signals is None:
@@ -128,14 +128,14 @@ class CommandedGroup:
     """Group of targets that a command addresses by name; the name is optional if there is only one."""
 
     kind: str
-    """Noun for the things, for messages."""
+    """Noun for the targets, for messages."""
     members: Mapping[str, Commanded]
 
     def command(self, words: list[str]) -> None:
-        """Carry out one command.
+        """Execute one command.
 
         Raises:
-            InputError: it names none of them, or is unknown.
+            InputError: the target or the command is unknown.
         """
         if words and words[0] in self.members:
             self.members[words[0]].command(words[1:])
@@ -157,9 +157,9 @@ class FaultConsole:
         self._say = say
 
     async def run(self) -> None:
-        """Carry out lines until cancelled; the end of the input ends the commands, not the devices.
+        """Execute lines until cancelled; the end of the input ends the commands, not the devices.
 
-        A program in the background of a terminal gets no lines: its reads fail instead of stopping it.
+        A background process of a terminal receives no lines: its reads fail instead of stopping it.
         """
         if not _pollable(self._source):
             await asyncio.Event().wait()
@@ -181,7 +181,7 @@ class FaultConsole:
         await asyncio.Event().wait()
 
     def execute(self, line: str) -> None:
-        """Carry out one line; answers ``ok`` or an error, or the commands if the last word is ``help``."""
+        """Execute one line; prints ``ok`` or an error, or the commands if the last word is ``help``."""
         words = line.split()
         if not words:
             return
@@ -194,7 +194,7 @@ class FaultConsole:
 
 
 def _read(source: int) -> bytes:
-    """Text written since the last call, at least a line; empty if the terminal has ended or another uses it."""
+    """Return the text written since the last call, at least one line; empty without a terminal to read from."""
     try:
         return os.read(source, 65536)
     except OSError:
@@ -202,7 +202,7 @@ def _read(source: int) -> bytes:
 
 
 def _pollable(source: TextIO) -> bool:
-    """Pipes, sockets and terminals can; files, /dev/null and a closed input cannot."""
+    """Whether ``source`` can be polled, as pipes, sockets and terminals can, but not files or /dev/null."""
     try:
         mode = os.fstat(source.fileno()).st_mode
     except (OSError, ValueError):

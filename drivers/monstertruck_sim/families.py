@@ -1,7 +1,7 @@
-"""Fault families generated from the emulated devices' own signals: every way to falsify each signal.
+"""Fault families generated from the emulated devices' own signals: one family for each way to falsify a signal.
 
-The catalog in ``faults`` lists known faults. This module lists none: every device that declares its signals, plug-ins
-included, gets its families.
+The catalog in ``faults`` lists known faults. This module lists none: it derives the families from the signals that
+devices declare, including those of plug-ins.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -15,14 +15,14 @@ from monstertruck_sim.faults import Fault, SimContext
 from monstertruck_sim.robot import SimulatedRobot
 
 MESSAGE: Final = "message"
-"""Stands for all signals of a device: its messages as a whole."""
+"""Signal name that stands for the messages of a device as a whole."""
 
 Draw = Callable[[np.random.Generator, float], float]
-"""Argument of a signal's fault, computed from the signal and its greatest magnitude so far."""
+"""Draws the argument of a signal's fault; takes the maximum magnitude of the signal so far."""
 
 
 def _of_extent(least: float, greatest: float, *, signed: bool = False) -> Draw:
-    """Draw a share of the signal's extent; of 1 where it was always 0."""
+    """Draw a fraction of the signal's extent, or of 1 if the signal was always 0."""
 
     def draw(rng: np.random.Generator, extent: float) -> float:
         sign = float(rng.choice((-1.0, 1.0))) if signed else 1.0
@@ -36,7 +36,7 @@ def _between(least: float, greatest: float) -> Draw:
 
 
 def _factor(rng: np.random.Generator, _: float) -> float:
-    """Draw none of it, less of it, or more of it."""
+    """Draw a factor: 0, below 1 or above 1."""
     return (0.0, float(rng.uniform(0.2, 0.9)), float(rng.uniform(1.1, 3.0)))[rng.integers(3)]
 
 
@@ -56,14 +56,14 @@ ARGUMENTS: Final[Mapping[str, Draw]] = {
     "repeated": lambda rng, _: float(rng.integers(2, 20)),
     "shifted": lambda rng, _: float(rng.choice((-1, 1)) * rng.integers(5, 120)),
 }
-"""Arguments of the faults that take one."""
+"""Arguments of the faults, by fault."""
 
 MESSAGES: Final[Mapping[str, Draw]] = {
     "lose_rate": _between(0.1, 0.8),
     "double_rate": _between(0.1, 1.0),
     "delay": _between(0.02, 0.5),
 }
-"""Faults of whole messages, by their names on the cable's console."""
+"""Faults of whole messages, by their names on the console of the cable."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,12 +72,12 @@ class Family:
 
     role: str
     signal: str
-    """Or ``MESSAGE``."""
+    """Name of the signal, or ``MESSAGE``."""
     fault: str
 
     @property
     def name(self) -> str:
-        """For reports."""
+        """Name for reports."""
         return f"{self.role} {self.signal} {self.fault}"
 
     def draw(self, rng: np.random.Generator, hold: float) -> Fault[SimContext]:

@@ -1,7 +1,7 @@
 """Faults of the simulation: their kinds, their places, and the catalog of random faults.
 
-A fault is a pair of actions on a ``SimContext``: one starts it, one ends it. Scripted scenarios and random drills both
-are made of the actions defined here.
+A fault is a pair of actions on a ``SimContext``: one starts it, the other ends it. Scripted scenarios and random drills
+use the same actions.
 """
 
 import asyncio
@@ -36,9 +36,9 @@ SERIAL: Final = (
     *("drive", "steering", "lidar", "lidar_2", "compass", "stabiliser"),
     *(*MORE_DRIVES, "wheels", "actuators", "sonar", "imu"),
 )
-"""Roles of devices whose kinds are on a serial line, most of them."""
+"""Roles of devices, most of whose kinds use a serial line."""
 VITAL: Final = ("drive", "steering", "lidar", "lidar_2", "compass", *MORE_DRIVES, "wheels", "actuators", "sonar")
-"""Roles whose silence stops the robot; the sonars only as its guard, without a lidar."""
+"""Roles whose silence stops the robot; the sonars only if they replace the lidar."""
 SHORT_WRITES: Final = 19
 """Maximum number of consecutive writes cut in half."""
 ALL_ROUND: Final = "-135 135"
@@ -90,32 +90,32 @@ class FaultKind(StrEnum):
 
 
 class RecorderDisk(Protocol):
-    """A recorder whose disk can fail."""
+    """Recorder whose disk can fail."""
 
     def refuse(self, error: OSError) -> None:
-        """Fail every write that follows."""
+        """Make every following write fail."""
 
 
 class ComputerPower(Protocol):
-    """The supply of the computer that a daemon runs on."""
+    """Supply of the computer that a daemon runs on."""
 
     async def cut(self) -> None:
-        """End the daemon at once; cables to it must be dead before."""
+        """End the daemon at once; its cables must be dead before."""
 
     def give(self) -> None:
-        """The computer has started, and with it a new daemon."""
+        """Start a new daemon, as after the computer's start."""
 
 
 class Workers(Protocol):
     """Worker processes of a daemon."""
 
     def kill(self, name: str) -> None:
-        """Kill a worker as SIGKILL does, and wait for its end; no effect if it does not run."""
+        """Kill a worker as SIGKILL does, and wait for its end; no effect if the worker is not running."""
 
 
 @dataclass(frozen=True, slots=True)
 class SimContext:
-    """Targets of faults: the simulated side, and from the daemon only its disk, its workers and its computer's supply.
+    """Targets of faults: the simulation, and of the daemon only its disk, its workers and its computer's supply.
 
     Args:
         config: configuration of the simulation.
@@ -124,8 +124,8 @@ class SimContext:
         computer: USB tree and cables.
         clock: time.
         disk: disk of the recording; None without a recorder.
-        power: None where the computer is this one.
-        workers: None where no fault acts on them.
+        power: supply of the computer; None if it is this computer.
+        workers: worker processes; None if no fault affects them.
     """
 
     config: SimConfig
@@ -138,14 +138,14 @@ class SimContext:
     workers: Workers | None = None
 
     def device(self, role: str) -> Emulated:
-        """Emulator and cable of a device."""
+        """Return the emulator and cable of a device."""
         return Emulated(self.robot.emulators[role], self.computer.ports[role])
 
     def signals(self, role: str) -> Signals:
         """Return the signals of a device, or of a monitor of the computer.
 
         Raises:
-            InputError: the robot has no such device, or it names no signals.
+            InputError: the robot has no such device, or the device declares no signals.
         """
         signals = signals_of(self.robot.emulators.get(role) or self.robot.monitored.get(role))
         if signals is None:
@@ -164,16 +164,16 @@ class SimContext:
             self.robot.monitored[name].inject(fault, *values)
 
     def lose_hubs(self, *hubs: str) -> None:
-        """Take hubs off the bus."""
+        """Make hubs drop off the bus."""
         for hub in hubs:
             self.computer.usb.lose_hub(hub)
 
     async def return_hubs(self, *hubs: str, enumerated: bool = False) -> None:
-        """Bring them back; the kernel enumerates each hub in a separate work item (``usb_hub_wq``), so in parallel.
+        """Return hubs to the bus; the kernel enumerates them in parallel, each in its own work item (``usb_hub_wq``).
 
         Args:
             hubs: names.
-            enumerated: whether all devices behind the hub are present at once, as after a start of the computer.
+            enumerated: whether all devices behind the hub are present at once, as after the computer's start.
         """
         times = {"first": 0.0, "between": 0.0} if enumerated else {}
         usb, clock = self.computer.usb, self.clock
@@ -191,18 +191,18 @@ class SimContext:
 
 C = TypeVar("C", bound=SimContext)
 Action = Callable[[C], Awaitable[None] | None]
-"""One end of a fault."""
+"""Start or end of a fault."""
 
 
 async def apply(action: Action[C], context: C) -> None:
-    """Carry out one end of a fault."""
+    """Execute the start or end of a fault."""
     waiting = action(context)
     if waiting is not None:
         await waiting
 
 
 def nothing(_: SimContext) -> None:
-    """End of a fault that passes by itself."""
+    """End a fault that passes by itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,10 +210,10 @@ class Fault(Generic[C]):
     """A temporary fault.
 
     Args:
-        name: for reports.
-        start: makes it.
-        end: takes it away.
-        hold: seconds it lasts.
+        name: name for reports.
+        start: starts the fault.
+        end: ends the fault.
+        hold: duration (s).
     """
 
     name: str
@@ -226,22 +226,22 @@ class Fault(Generic[C]):
 
 
 def command(role: str, *lines: str) -> Action[SimContext]:
-    """Commands of the fault console to a device."""
+    """Return an action that sends fault console commands to a device."""
     return lambda context: context.command(role, *lines)
 
 
 def monitored(name: str, fault: str, *values: str) -> Action[SimContext]:
-    """Change the readings of a monitor."""
+    """Return an action that changes the readings of a monitor."""
     return lambda context: context.monitored(name, fault, *values)
 
 
 def exchange_cables(one: str, other: str) -> Action[SimContext]:
-    """Swap two devices' cables between their ports; a second call undoes it."""
+    """Return an action that swaps two devices' cables between their ports; a second call undoes it."""
     return lambda context: context.exchange_cables(one, other)
 
 
 def place_obstacle(gap: float) -> Action[SimContext]:
-    """A post ``gap`` metres before the front bumper."""
+    """Return an action that places a post ``gap`` metres in front of the bumper."""
     post_radius = 0.1  # radius of an obstacle, m
 
     def place(context: SimContext) -> None:
@@ -255,12 +255,12 @@ def place_obstacle(gap: float) -> Action[SimContext]:
 
 
 def block_shaft(shaft: int = 0, *, on: bool) -> Action[SimContext]:
-    """Hold a driven shaft, or let it go."""
+    """Return an action that holds or releases a driven shaft."""
     return lambda context: context.robot.world.block_shaft(context.clock.now(), shaft, on=on)
 
 
 def clear_obstacles(context: SimContext) -> None:
-    """Take everything away that was put into the world."""
+    """Remove all objects that were added to the world."""
     for post in context.robot.world.obstacles:
         context.robot.world.remove(context.clock.now(), post)
 
@@ -270,11 +270,11 @@ def clear_obstacles(context: SimContext) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CatalogFault(Fault[SimContext]):
-    """A fault as the catalog draws it.
+    """A fault drawn from the catalog.
 
     Args:
-        kind: kind of its kind.
-        must_stop: the truck must stand soon, and stay so.
+        kind: kind of the fault.
+        must_stop: whether the truck must stop soon and stay at rest.
         disarms: whether the fault must disarm the robot, which must not start again by itself.
     """
 
@@ -297,13 +297,13 @@ def hubs_of(devices: Devices, without: Collection[str] = ()) -> tuple[str, ...]:
 
 
 class FaultCatalog:
-    """Faults that a robot can have.
+    """Catalog of the faults of a robot.
 
     Args:
         devices: devices of the robot.
         monitors: monitors of its computer, by name.
-        records: whether its daemon writes a log.
-        restarts: whether its computer can be switched off.
+        records: whether the daemon writes a log.
+        restarts: whether the computer can be switched off.
         workers: names of its daemon's worker processes.
         unguarded: roles of motor controllers without any device that stops them while they are unreachable; they are
             never disconnected.
@@ -330,7 +330,7 @@ class FaultCatalog:
         self._motors = settings.motors if isinstance(settings, StepperConfig) else 0
         self._hubs = hubs_of(devices, unguarded)
         self._all_hubs = self._hubs == hubs_of(devices)
-        """Whether all of them may be lost at once."""
+        """Whether all hubs may be lost at once."""
         self._monitors = monitors
         self._records = records
         self._restarts = restarts
@@ -339,11 +339,11 @@ class FaultCatalog:
 
     @property
     def kinds(self) -> tuple[FaultKind, ...]:
-        """Faults that ``draw`` can return."""
+        """Kinds of faults that ``draw`` can return."""
         return tuple(self._makers)
 
     def draw(self, rng: np.random.Generator, *, without: frozenset[FaultKind] = frozenset()) -> CatalogFault:
-        """One fault; all kinds are equally likely."""
+        """Draw one fault; all kinds are equally likely."""
         kinds = [kind for kind in self._makers if kind not in without]
         return self._makers[kinds[rng.integers(len(kinds))]](rng)
 
@@ -444,7 +444,7 @@ def _fault(
     must_stop: bool = False,
     disarms: bool = False,
 ) -> CatalogFault:
-    """A fault at a device, hub or rail."""
+    """Return a fault of a device, hub or rail."""
     name = f"{kind.value}: {where}" if where else kind.value
     return CatalogFault(name=name, start=start, end=end, hold=hold, kind=kind, must_stop=must_stop, disarms=disarms)
 
@@ -487,7 +487,7 @@ def _noise(rng: np.random.Generator) -> str:
 
 
 def _held_wheel(rng: np.random.Generator, motors: int) -> CatalogFault:
-    """A stepper that is held loses steps without reporting it."""
+    """Hold a wheel: a stepper then loses steps without reporting it."""
     motor = int(rng.integers(motors)) + 1
     return _cable(rng, FaultKind.HELD_WHEEL, "wheels", *_switch(f"overload {motor}"))
 
@@ -504,7 +504,7 @@ def _encoder(rng: np.random.Generator, kind: FaultKind, fault: str) -> CatalogFa
 
 
 def _cross_talk(rng: np.random.Generator, name: str) -> CatalogFault:
-    """Sound of another sonar: an echo from a distance without an object."""
+    """Simulate the sound of another sonar: an echo from a distance without an object."""
     metres = rng.uniform(0.15, 3.0)
     starts, ends = command("sonar", f"ghost {name} {metres:.2f}"), command("sonar", f"ghost {name} off")
     return _fault(FaultKind.CROSS_TALK, f"{name}, {metres:.2f} m", starts, ends, _hold(rng))
@@ -526,14 +526,14 @@ def _slow(rng: np.random.Generator, role: str) -> CatalogFault:
 
 
 def _short_write(rng: np.random.Generator, role: str, guarded: Collection[str]) -> CatalogFault:
-    """Many in a row disconnect a controller, so an unguarded controller gets few."""
+    """Shorten writes; many in a row disconnect a controller, so an unguarded controller gets few."""
     most = SHORT_WRITES if role in guarded else BRIEF_SILENCES
     start, end = (f"line short_writes {rng.integers(1, most + 1)}",), ("line short_writes 0",)
     return _cable(rng, FaultKind.SHORT_WRITE, role, start, end)
 
 
 def _blind(rng: np.random.Generator) -> CatalogFault:
-    """Covered all round, or in a part of it; the sun; a mirror."""
+    """Blind the lidar: a full or partial cover, the sun, or a mirror."""
     begin = rng.uniform(-110.0, 60.0)
     part = f"{begin:.0f} {begin + rng.uniform(20.0, 60.0):.0f}"
     where, fault = (
@@ -548,7 +548,7 @@ def _blind(rng: np.random.Generator) -> CatalogFault:
 
 
 def _clock_drift(rng: np.random.Generator) -> CatalogFault:
-    """A bad crystal, up to the slew of a clock that is set."""
+    """Simulate a bad crystal, or the slew of a clock that is being set."""
     ppm = float(rng.choice((-1.0, 1.0)) * 10 ** rng.uniform(2, 5))
     start, end = command("lidar", f"drift {ppm:.0f}"), command("lidar", "drift 0")
     return _fault(FaultKind.CLOCK_DRIFT, f"{ppm:+.3g} ppm", start, end, float(rng.uniform(2.0, 5.0)))
@@ -562,13 +562,13 @@ def _late_answers(rng: np.random.Generator, role: str) -> CatalogFault:
 
 
 def _supply_dip(rng: np.random.Generator, roles: tuple[str, ...]) -> CatalogFault:
-    """The controller restarts while the host waits for its answer; until it is up the truck coasts."""
+    """Restart the controller while the host waits for its answer; the truck coasts until it is up."""
     role = roles[0] if len(roles) == 1 else _pick(rng, roles)
     return _fault(FaultKind.SUPPLY_DIP, role, command(role, "restart 1"), nothing, 1.0 + _hold(rng), disarms=True)
 
 
 def _blocked_shaft(rng: np.random.Generator, shafts: int) -> CatalogFault:
-    """One shaft of several does not hold the robot: the others turn until the gate has noticed."""
+    """Block one of several shafts, which does not hold the robot: the others turn until the gate detects it."""
     shaft = 0 if shafts == 1 else int(rng.integers(shafts))
     held, free, where = block_shaft(shaft, on=True), block_shaft(shaft, on=False), "" if shafts == 1 else DRIVES[shaft]
     return _fault(FaultKind.BLOCKED_SHAFT, where, held, free, 1.0 + _hold(rng), must_stop=shafts == 1, disarms=True)
@@ -603,7 +603,7 @@ def _clock_jump(rng: np.random.Generator) -> CatalogFault:
 
 
 def _loop_stall(rng: np.random.Generator) -> CatalogFault:
-    """Another program uses the computer's processor; devices, cables and world continue."""
+    """Block the event loop, as another program on the processor does; devices, cables and world continue."""
     seconds = float(10 ** rng.uniform(-1.3, 0.5))
 
     def stall(context: SimContext) -> None:
@@ -627,7 +627,7 @@ def _obstacle(rng: np.random.Generator) -> CatalogFault:
 
 
 def _network(rng: np.random.Generator) -> CatalogFault:
-    """Interface gone, or no signal."""
+    """Remove the network interface, or its signal."""
     lost, back = (("remove",), ("plug",)) if rng.random() < 0.5 else (("signal", "-95"), ("signal", "-55"))
     lose, give_back = monitored("link", *lost), monitored("link", *back)
     return _fault(FaultKind.NETWORK, lost[0], lose, give_back, float(rng.uniform(1.5, 3.0)))
@@ -685,9 +685,9 @@ def _hubs(rng: np.random.Generator, kind: FaultKind, hubs: tuple[str, ...]) -> C
 
 
 def _computer_power(rng: np.random.Generator, hubs: tuple[str, ...]) -> CatalogFault:
-    """The computer's supply (M4-ATX) fails: computer, hubs, lidar and servos are dead, motor and stabiliser are not.
+    """Cut the computer's supply (M4-ATX): computer, hubs, lidar and servos are off, motor and stabiliser stay on.
 
-    The time the computer takes to start is not simulated: the fault ends with its hubs enumerated and a new daemon.
+    The boot time of the computer is not simulated: the fault ends with enumerated hubs and a new daemon.
     """
 
     async def lose(context: SimContext) -> None:
@@ -706,7 +706,7 @@ def _computer_power(rng: np.random.Generator, hubs: tuple[str, ...]) -> CatalogF
 
 
 def _battery_off(rng: np.random.Generator) -> CatalogFault:
-    """Motor, servos and stabiliser lose their supply; the computer keeps its own."""
+    """Cut the supply of motor, servos and stabiliser; the computer keeps its own."""
 
     def pull(context: SimContext) -> None:
         context.robot.world.connect_battery(context.clock.now(), connected=False)
@@ -724,10 +724,10 @@ def _battery_off(rng: np.random.Generator) -> CatalogFault:
 
 
 class FaultInjector:
-    """Injects random faults into a running simulation, by its configuration's ``sim.drill``.
+    """Injects random faults into a running simulation, as configured in ``sim.drill``.
 
     Args:
-        context: where.
+        context: targets of the faults.
         config: seed and period.
         report: called with a line for each fault.
     """
@@ -747,7 +747,7 @@ class FaultInjector:
         self._report = report
 
     async def run(self) -> None:
-        """One after another until cancelled."""
+        """Inject one fault after another until cancelled."""
         clock = self._context.clock
         full = frozenset[FaultKind]()
         while True:

@@ -1,4 +1,4 @@
-"""A truck of emulated devices in a simulated world, on any clock and any kind of port."""
+"""Truck of emulated devices in a simulated world, on any clock and any kind of port."""
 
 import asyncio
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ from monstertruck_sim.world.world import World
 
 
 def carries_lidar(devices: Devices) -> bool:
-    """Whether the robot carries the weight of a lidar, or at least of its turning mount."""
+    """Whether the robot carries a lidar, or at least its stabilised mount."""
     return devices.lidar is not None or devices.stabiliser is not None
 
 
@@ -30,14 +30,14 @@ class SimulatedRobot:
     """World and emulators, wired as on the truck.
 
     Args:
-        config: the simulated side's settings.
-        devices: the robot's, with their settings.
-        monitors: monitored quantities of the computer.
+        config: settings of the simulation.
+        devices: devices of the robot, with their settings.
+        monitors: monitors of the computer.
         clock: time of world and devices.
         ports: one emulated port per device role; ``run`` plugs them in.
         root: folder of the emulated computer, for its monitors.
-        offload: where the camera's pictures are drawn.
-        scene: world that it shares with other robots; None: its own.
+        offload: runs the drawing of the camera's pictures.
+        scene: world shared with other robots; None: a separate one.
         name: name of the robot.
     """
 
@@ -65,7 +65,7 @@ class SimulatedRobot:
         self.monitored: dict[str, FileEmulator] = {
             role: emulated(role, kind_of(settings), settings) for role, settings in monitors.present().items()
         }
-        """Values of the computer's files, by monitor."""
+        """Emulated files of the computer, by monitor."""
         self._kinds = {role: device.kind for role, device in devices.present().items()}
         self.emulators: dict[str, Emulator] = {
             role: emulated(role, device.kind, device.driver) for role, device in devices.present().items()
@@ -76,7 +76,7 @@ class SimulatedRobot:
         self._wire_deadman(config, devices)
 
     def _wire_deadman(self, config: SimConfig, devices: Devices) -> None:
-        """The servo controller's own time-out, and its output to the drive controllers' quick-stop inputs."""
+        """Set the servo controller's timeout, and connect its output to the drive controllers' quick-stop inputs."""
         maestro = self.emulators.get(DeviceRole.STEERING)
         if devices.steering is None or not isinstance(maestro, MaestroEmulator):
             return

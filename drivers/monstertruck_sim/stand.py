@@ -1,4 +1,4 @@
-"""The test stand of the simulated world: sees the robot from outside, with the noise of a camera over the table."""
+"""Test stand of the simulated world: observes the robot from outside, with the noise of a camera above the table."""
 
 import math
 from collections.abc import Callable
@@ -12,14 +12,14 @@ from monstertruck_sim.world.world import World
 
 
 class SimulatedStand:
-    """Sees the robot at a steady rate.
+    """Observes the robot at a constant rate.
 
     Args:
         config: rate and noise.
-        world: with the robot in it.
+        world: world with the robot.
         clock: time.
         put: called with every pose.
-        seed: seed of the noise; None: none.
+        seed: seed of the noise; None: no noise.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class SimulatedStand:
             await self._clock.sleep_until(due)
 
     def look(self) -> StandPose:
-        """Current pose."""
+        """Return the current pose."""
         now, config = self._clock.now(), self._config
         truth = self._world.truth(now)
         x, y, turn = (0.0, 0.0, 0.0) if self._noise is None else self._noise.at(self._count)

@@ -182,7 +182,7 @@ class Calibration:
         self._task = asyncio.create_task(self._run(step, options), name=f"calibration {step}")
 
     def answer(self, value: float | bool) -> None:
-        """Answer the wizard's question; raises as ``PagePanel.answer`` does."""
+        """Answer the wizard's question; raises the errors of ``PagePanel.answer`` does."""
         self._panel.answer(value)
 
     def decide(self, *, accept: bool) -> None:

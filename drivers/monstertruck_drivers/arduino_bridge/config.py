@@ -17,11 +17,11 @@ class ArduinoBridgeConfig(Schema):
 
     kind: Literal["arduino_bridge"] = "arduino_bridge"
     counts_per_turn: Annotated[int, Field(ge=4, le=1_000_000)] = 1440
-    """Encoder counts per turn of the shaft; of the wheel if `geometry.drive_ratio` is 1"""
+    """Encoder counts per turn of the shaft (of the wheel if `geometry.drive_ratio` is 1)"""
     pid_rate: Annotated[float, Field(gt=0, le=1000)] = PID_RATE
-    """Rate of its speed controller, Hz (`PID_RATE` of the firmware)"""
+    """Rate of the board's speed controller (Hz, `PID_RATE` of the firmware)"""
     inverted: Annotated[tuple[bool, bool], Field(strict=False)] = (False, False)
-    """Left and right: whether driving forward needs negative counts"""
+    """Whether driving forward needs negative counts (left, right)"""
     max_rate: Annotated[float, Field(gt=0, le=1000)] = 10.0
     """Maximum motor rate (rad/s)"""
     deceleration: Annotated[float, Field(gt=0)] = 20.0
@@ -39,7 +39,7 @@ class ArduinoBridgeConfig(Schema):
     command_timeout: Seconds = 0.25
     """Age of the latest command at which the motors stop (s)"""
     boot: Annotated[float, Field(ge=0, le=10)] = 3.0
-    """Maximum time until a board answers after its port was opened (s): most boards restart then"""
+    """Maximum time from opening the port to the board's first answer (s); most boards restart when the port opens"""
 
     @property
     def shafts(self) -> int:
@@ -58,7 +58,7 @@ class ArduinoBridgeConfig(Schema):
 
     @property
     def stop_words(self) -> str:
-        """Empty: the stop script needs only the port."""
+        """Arguments of the stop script: none, because it needs only the port."""
         return ""
 
     @model_validator(mode="after")

@@ -1,8 +1,8 @@
-"""Device side of ROSArduinoBridge: text lines, a controller with whole counts, and its auto-stop.
+"""Device side of ROSArduinoBridge: text lines, a speed controller in whole counts, and the auto-stop timer.
 
 Behaviour of the real board: it restarts when its port is opened, ignores input for 1.5 s, and then counts from 0. It
-executes damaged commands, because there is no checksum. It holds whole counts per period of its controller. It stops
-the motors when no set-points arrive, after two seconds as published.
+executes damaged commands, because there is no checksum. Its speed controller works in whole counts per period. It stops
+the motors when no set-point has arrived for two seconds (published firmware).
 """
 
 import asyncio
@@ -27,7 +27,7 @@ TO_RPM: Final = 60.0
 class ArduinoBridgeEmulator(FaultyDevice):
     """Board with two motors.
 
-    Faults (``inject``): ``silent on|off`` (gives no answers), ``late SECONDS [COUNT]`` (answers), ``noise COUNT``
+    Faults (``inject``): ``silent on|off`` (no answers), ``late SECONDS [COUNT]`` (late answers), ``noise COUNT``
     (COUNT answers have a wrong byte), ``reset``, ``runaway`` (both motors disobey, see ``DisobedientMotor``).
 
     Args:

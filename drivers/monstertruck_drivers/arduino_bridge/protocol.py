@@ -35,19 +35,19 @@ _NUMBER: Final = re.compile(rb"\d{4,7}")
 
 
 def speeds(left: int, right: int) -> bytes:
-    """Command: counts for each period of the controller."""
+    """Return the command that sets wheel speeds (counts per controller period)."""
     return b"m %d %d\r" % (left, right)
 
 
 def pwm(left: int, right: int) -> bytes:
-    """Command: raw PWM."""
+    """Return the command that sets raw PWM."""
     return b"o %d %d\r" % (left, right)
 
 
 ENCODERS: Final = b"e\r"
 BAUD_RATE: Final = b"b\r"
 END: Final = b"\r"
-"""Terminates a partial command of a dead host."""
+"""Terminates a partial command left by a host that died."""
 
 
 def counts_of(line: bytes) -> tuple[int, int] | None:

@@ -1,4 +1,4 @@
-"""The device side of a bus of AX-12A behind a USB2Dynamixel, byte for byte."""
+"""Device side of a bus of AX-12A behind a USB2Dynamixel, byte for byte."""
 
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
@@ -67,7 +67,7 @@ class Ax12Bus(FaultyDevice):
     """Up to six units on one half-duplex line; ``end.baud = 1_000_000`` gives exchanges their real duration.
 
     USB powers the adapter, the 12 V rail the units: unplugging does not affect the units, ``power off`` silences them
-    all while the port stays. Two units with one number both answer and garble each other.
+    all while the port stays. Two units with the same id both answer, and their answers collide.
     Faults (``inject``): ``vanish ID``, ``return ID``, ``power on|off``, ``block ID on|off``, ``freeze ID on|off``
     (position sensor), ``heat ID CELSIUS``, ``voltage VOLTS|source``, ``trip ID`` (overload now), ``stray ID
     POSITION|off`` (turns to POSITION instead of its goal), ``reset ID`` (factory), ``renumber ID NEW``,
@@ -149,7 +149,7 @@ class Ax12Bus(FaultyDevice):
         return float(self.angles(ident, np.array([time_ns]))[0])
 
     def angles(self, ident: int, times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-        """The same at several instants: the latest may be new, all may lie up to two seconds in the past."""
+        """Shaft angles of a unit at several times (ns), at most two seconds in the past; see ``angle``."""
         return self._find(ident).angles(times_ns) * p.STEP
 
     def power_cycle(self) -> None:
@@ -224,7 +224,7 @@ class Ax12Bus(FaultyDevice):
             self._sync_write(packet.params)
             return
         answers = [answer for unit in units if (answer := self._execute(unit, packet)) is not None]
-        # A ping to everybody is answered where only one can.
+        # A broadcast ping is answered only if a single unit is on the bus.
         if packet.unit != p.BROADCAST or (packet.code == Instruction.PING and len(units) == 1):
             self._answer(end, answers, units)
 
@@ -319,7 +319,7 @@ class TrueJoints:
 def emulated(setup: EmulatorSetup) -> Ax12Bus:
     """Create both units below a simulated truck's lidar, at rest with the lidar parallel to the body.
 
-    A line of realistic speed.
+    The line has its real speed.
     """
     config: Ax12Config = setup.settings or Ax12Config()
     joints, horns = (config.pitch, config.roll), setup.physics.horns()

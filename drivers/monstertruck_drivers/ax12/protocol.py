@@ -47,7 +47,7 @@ class Instruction(IntEnum):
 
 
 class Alarm(IntFlag):
-    """Error bits of a status packet; several may be set, and its data is valid all the same."""
+    """Error bits of a status packet. Several may be set; the packet's data remains valid."""
 
     VOLTAGE = 1 << 0
     ANGLE = 1 << 1
@@ -195,7 +195,7 @@ class Packet:
 
 
 def ping(unit: int) -> bytes:
-    """Answered by a status without data."""
+    """Return a ping request; the unit answers with a status packet without data."""
     return Packet(unit, Instruction.PING).encode()
 
 

@@ -42,9 +42,9 @@ def unit_signals(number: int) -> dict[str, SignalKind]:
 
 
 TICK: Final = 2_000_000
-"""Nanoseconds of one step of the motion."""
+"""Step of the motion simulation (ns)."""
 OVERLOAD_TIME: Final = 1.0
-"""Time of overload until the alarm (s)."""
+"""Overload duration that triggers the alarm (s)."""
 AMBIENT: Final = 25.0
 NO_ALARM: Final = Alarm(0)
 
@@ -52,8 +52,8 @@ NO_ALARM: Final = Alarm(0)
 class Unit:
     """Device side of one servo; time advances when its state is read.
 
-    The shaft follows the goal with a speed proportional to the drive, which grows over the compliance slope from the
-    margin on, is never below the punch, and is cut by torque limit and moving speed. A load slows it down.
+    The shaft moves to the goal at a speed proportional to the drive. The drive rises over the compliance slope beyond
+    the margin, is at least the punch, and is limited by torque limit and moving speed. A load slows the shaft down.
 
     Args:
         ident: number on the bus.
@@ -118,7 +118,7 @@ class Unit:
         self._values[register.address] = value
 
     def read(self, address: int, count: int, time_ns: int) -> tuple[Alarm, bytes]:
-        """Bytes of the table; only error bits of the request."""
+        """Read bytes of the table; the returned error bits concern only this request."""
         if not count or address + count > p.TABLE_SIZE:
             return Alarm.RANGE, b""
         self.advance(time_ns)
@@ -126,7 +126,7 @@ class Unit:
         return NO_ALARM, bytes(self._table[address : address + count])
 
     def write(self, address: int, data: bytes, time_ns: int) -> Alarm:
-        """Write all of it or, with an error bit, nothing."""
+        """Write all bytes, or none if an error bit is returned."""
         error = self._refusal(address, data)
         if error:
             return error
@@ -300,7 +300,7 @@ class Unit:
         return copysign(min(drive, limit, 1.0), left)
 
     def _wanted_speed(self) -> float:
-        """Steps a second."""
+        """Commanded speed (steps/s)."""
         push = self._load(self.get(p.ID), self._time)
         rated_voltage = 12.0
         volts = self._volts() / rated_voltage
@@ -357,5 +357,5 @@ def steady_voltage(_: int) -> float:
 
 
 def no_load(_: int, __: int) -> float:
-    """Nothing pushes."""
+    """Return no load torque."""
     return 0.0

@@ -15,8 +15,8 @@ class PackConfig(Schema):
     """Lithium-polymer pack and its limits; the default is 6S.
 
     Low, critical, clear and overcharged are compared with the voltage at rest (the measured voltage plus the sag from
-    the motor's current), collapsed with the measured voltage. Only the calibration of the scale distinguishes a pack
-    from a wrong scale: an error of 5 % makes a full pack overcharged.
+    the motor's current), collapsed with the measured voltage. Calibrate the voltage scale: an error of 5 % makes a full
+    pack look overcharged.
     """
 
     cells: Annotated[int, Field(ge=1, le=14)] = 6
@@ -24,8 +24,8 @@ class PackConfig(Schema):
     capacity_ah: Annotated[float, Field(gt=0, le=100)] = 5.0
     """Capacity of the pack in the truck (Ah): 3.7, 4.0 or 5.0"""
     resistance: Annotated[float, Field(ge=0, le=1)] = 0.06
-    """Resistance of cells and wiring for the sag, ohm; 5 to 15 milliohm per cell are usual. Fit it from a start of the
-    motor: with half the true value the charge reads up to 0.2 too low at 100 W
+    """Resistance of cells and wiring for the sag, ohm; 5 to 15 milliohm per cell are usual. Fit it to the voltage drop
+    at a motor start: with half the true value the charge reads up to 0.2 too low at 100 W
     """
     max_compensation: Volts = 1.5
     """Maximum sag attributed to the motor's current, so that a wrong current cannot hide an empty pack"""

@@ -49,7 +49,7 @@ class IioEmulator(FaultyDevice):
     ) -> None:
         self.name = "battery"
         self.plugged = False
-        """Whether the kernel presents it."""
+        """Whether the converter is plugged in."""
         self._files = FileTree(root / CONVERTERS)
         self._clock = clock
         self._source = source

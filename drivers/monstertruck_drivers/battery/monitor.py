@@ -32,8 +32,8 @@ _CHARGES: Final = np.linspace(0.0, 1.0, len(CELL_VOLTS))
 def charge_of(cell_volts: float) -> float:
     """Remaining charge at a resting cell voltage, 0..1.
 
-    Between 20 and 60 % a cell changes by 8 to 35 mV per 5 %, less than a 10-bit converter resolves behind a
-    divider for six cells: no better than 0.1 either way.
+    Between 20 and 60 % a cell changes by 8 to 35 mV per 5 %, less than a 10-bit converter resolves behind a divider for
+    six cells. The result is no more accurate than +-0.1.
     """
     return float(np.interp(cell_volts, CELL_VOLTS, _CHARGES))
 
@@ -194,7 +194,7 @@ class BatteryMonitor:
         )
 
     def _motor_current(self, stamp: int) -> float | None:
-        """Return the latest current; not every feedback carries one."""
+        """Return the latest motor current (A); None if the feedback carries none."""
         feedback = self._drive.latest if self._drive is not None else None
         if feedback is not None and feedback.current is not None:
             self._current, self._current_at = feedback.current, feedback.stamp

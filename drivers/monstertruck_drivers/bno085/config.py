@@ -9,7 +9,7 @@ from monstertruck_schemas.base import FrameId, Schema
 
 
 class Bno085Config(Schema):
-    """CEVA BNO085 in UART-RVC mode (PS0 high, PS1 low): tilt, specific force, turn rate from its heading.
+    """CEVA BNO085 in UART-RVC mode (PS0 high, PS1 low): tilt, specific force, and a turn rate derived from its heading.
 
     Its heading is relative to power-up and drifts by half a degree a minute, so it does not replace a compass.
     """

@@ -16,7 +16,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import STANDARD_GRAVITY, Attitude, Imu
 
 LONGEST_GAP: Final = 10
-"""Maximum number of missing frames between the two of a turn rate; at 10 rad/s half a turn is 31 frames."""
+"""Maximum number of frames missing between two frames that yield a turn rate; at 10 rad/s half a turn is 31 frames."""
 
 
 def body_rates(before: RvcFrame, after: RvcFrame) -> Xyz | None:
@@ -115,7 +115,7 @@ class Bno085Driver:
         newest = received - round(config.delay * SECOND)
         self._out.put(
             Imu(
-                # A rate applies to the middle between two frames, the mean to the middle of its rates.
+                # A rate applies midway between its two frames; the mean applies midway between the averaged rates.
                 stamp=newest - len(rates) * SECOND // (2 * RATE),
                 received=received,
                 seq=self._out.next_seq(),

@@ -29,9 +29,11 @@ class EposConfig(Schema):
     acceleration_rpm_s: RpmPerSecond = 60_000
     """Acceleration of the motor (rpm/s)."""
     deceleration_rpm_s: RpmPerSecond = 200_000
-    """Acceleration: 2.4 m/s^2, below the limit of the slipper clutch; the wheels follow the motor about 0.1 s later."""
+    """Deceleration (rpm/s): 2.4 m/s^2, below the limit of the slipper clutch; the wheels lag the motor by about 0.1
+    s.
+    """
     quick_stop_deceleration_rpm_s: RpmPerSecond = 240_000
-    """Quick stop deceleration: full speed to rest in 0.08 s."""
+    """Quick stop deceleration (rpm/s): full speed to rest in 0.08 s."""
 
     encoder_pulses_per_turn: Annotated[int, Field(gt=0, le=65_535)] | None = 500
     """Encoder pulses per motor turn (counts / 4); None: the controller's setting."""
@@ -49,7 +51,7 @@ class EposConfig(Schema):
     quick_stop_after: Seconds = 1.0
     """Age of the last command at which the driver commands a quick stop (s)."""
     standstill_rpm: Annotated[int, Field(ge=1)] = 60
-    """Speed below which the motor is at rest."""
+    """Speed below which the motor is at rest (rpm)."""
 
     fault_resets: Annotated[int, Field(ge=0, le=10)] = 3
     """Maximum fault resets within ``fault_reset_window``; then the drive fails."""

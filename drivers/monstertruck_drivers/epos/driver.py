@@ -75,7 +75,7 @@ def sign(config: EposConfig) -> int:
 
 
 def settled(state: State, goal: State) -> bool:
-    """Whether nothing is left to do; a motor that is off needs no quick stop."""
+    """Whether ``state`` meets ``goal``; a motor that is off needs no quick stop."""
     return state is goal or (goal is State.QUICK_STOP and state in OFF)
 
 
@@ -123,11 +123,11 @@ class Odometer:
 
 
 SAFE_TIME = 0.225
-"""Maximum time at the end of a session to leave the motor stopped and disabled, in addition to the duration of the
-quick stop, measured from when the controller listens (s).
+"""Maximum time for stopping and disabling the motor at the end of a session (s), in addition to the duration of the
+quick stop; measured from when the controller listens.
 """
 SAFE_ATTEMPTS = 2
-"""Number of attempts, each with this time: the first may meet the rest of a damaged frame."""
+"""Number of attempts, each limited to ``SAFE_TIME``: the first may collide with the rest of a damaged frame."""
 STOPS = {State.QUICK_STOP: Control.QUICK_STOP, State.SWITCH_ON_DISABLED: Control.DISABLE_VOLTAGE}
 """Controlwords that must be sent without delay, by target state."""
 SLOW_EXCHANGE = 0.03
@@ -302,8 +302,8 @@ class _DriveSession:
     async def make_safe(self) -> None:
         """Brake, and switch the power stage off once the motor rests.
 
-        Each of ``SAFE_ATTEMPTS`` gives up ``SAFE_TIME`` after a quick stop from full speed would have ended, counted
-        from when the controller listens again: it is given the silence that a damaged or late answer before asks for.
+        Each of ``SAFE_ATTEMPTS`` attempts times out ``SAFE_TIME`` after a quick stop from full speed would have ended.
+        The time starts when the controller listens again: after a damaged or late answer it needs a silence.
         """
         full_speed = self._config.max_motor_rpm / self._config.quick_stop_deceleration_rpm_s
         # Maximum wait for a quick stop (s), whatever its configured deceleration.
@@ -443,7 +443,7 @@ class _DriveSession:
     async def _act(self, *, also_faster: bool = False) -> None:
         """Send urgent commands: a quick stop, power stage off, a lower target.
 
-        A higher target only at the start of a cycle.
+        ``also_faster``: send a higher target as well, which happens only at the start of a cycle.
         """
         setpoint = self._setpoint()
         if setpoint.goal is State.ENABLED:

@@ -46,7 +46,7 @@ FAULT_NAMES = {
 
 
 class EposEmulator(FaultyDevice):
-    """Emulated controller; set ``end.baud = 38400`` for exchanges of real duration.
+    """Emulated controller; set ``end.baud = 38400`` for real exchange times.
 
     Faults (``inject``): ``fault CODE|NAME [passing]``: into FAULT; the cause stays until ``clear`` unless passing.
     ``busy``, ``refuse``, ``flip``, ``stray`` ``[COUNT]``: opcodes refused, frames refused, answers with a wrong bit,

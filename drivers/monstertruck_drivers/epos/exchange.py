@@ -36,9 +36,9 @@ T = TypeVar("T")
 QUIET = 0.55
 """Silence that reliably makes a controller with factory settings drop an incomplete frame (s)."""
 QUICK_ANSWER = 0.05
-"""Maximum duration of recent exchanges on a fast line (s): there a missing byte is lost, not late."""
+"""Maximum duration of recent exchanges on a fast line (s); on such a line a missing byte is lost, not late."""
 RECENT = 32
-"""Exchanges whose duration is judged."""
+"""Number of latest exchanges whose median duration is judged."""
 ATTEMPTS = 3
 """Number of attempts at an exchange outside the schedule."""
 BRIEF_SILENCES = 2
@@ -232,11 +232,12 @@ class Exchanger:
         self._link.discard()
 
     def _be_silent(self, *, waited: bool) -> None:
-        """Require silence after a failure: the controller drops its half frame, timed from either side's last byte.
+        """Require silence after a failure, from the last byte of either side, so that the controller drops its frame.
 
-        The silence is brief if the controller drops half frames soon. It is as long as for factory settings after more
-        than ``BRIEF_SILENCES`` failures, and when an answer may still come. On a quick line, that is an answer not
-        ``waited`` for: there the controller has sent its last byte within the duration of an exchange.
+        The silence is brief if the controller drops incomplete frames early. It is as long as for factory settings
+        after more than ``BRIEF_SILENCES`` failures, and while an answer may still arrive. On a fast line an answer may
+        still arrive only if it was not ``waited`` for, because the controller sends its last byte within the duration
+        of an exchange.
         """
         quick = self._is_quick()
         last = self._touched if quick else self._clock.now()
@@ -314,11 +315,7 @@ class Exchanger:
         return byte[0]
 
     def _skipped(self, stray: bytes, awaited: str) -> bytes:
-        """Note unknown bytes before an awaited one.
-
-        Raises:
-            ProtocolError: there are more than three.
-        """
+        """Record unknown bytes before an expected one."""
         self.strange = stray
         if len(stray) > 3:
             raise ProtocolError(f"{self._link.name}: {stray.hex(' ')} instead of {awaited}")
@@ -390,9 +387,9 @@ class _BusyError(Exception):
 
 
 class _HeldUpError(Exception):
-    """Whether the wait exceeded its limit.
+    """This process was suspended during an exchange.
 
-    The controller has long dropped this exchange and accepts a new one at once.
+    The controller has already dropped the exchange and accepts a new one at once.
     """
 
 

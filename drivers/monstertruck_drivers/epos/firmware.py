@@ -297,7 +297,7 @@ class Firmware:
         return (counts + 2**31) % 2**32 - 2**31
 
     def _velocity(self, reading: MotorReading) -> int:
-        """Velocity as counts within 1 ms, in rpm: coarse."""
+        """Velocity (rpm) from the counts within 1 ms, which is coarse."""
         per_ms = self._values[od.ENCODER_PULSES] * od.COUNTS_PER_PULSE / 60_000
         return round(round(reading.rpm * per_ms + self._rng.uniform(-0.5, 0.5)) / per_ms)
 

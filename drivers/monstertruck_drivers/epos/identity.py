@@ -64,7 +64,7 @@ async def _report(line: Exchanger, clock: Clock) -> dict[str, Any]:
 
 
 async def _serial_number(line: Exchanger) -> str | None:
-    """Hexadecimal; None where the firmware's segmented service differs from its documentation."""
+    """Serial number (hexadecimal); None if the firmware's segmented read differs from its documentation."""
     try:
         return (await line.read_long(od.SERIAL_NUMBER)).hex()
     except (DeviceTimeoutError, ProtocolError):

@@ -107,12 +107,12 @@ def decode_body(opcode: int, body: bytes) -> Frame:
 
 
 def read_request(entry: ObjectEntry, node: int) -> Frame:
-    """ReadObject."""
+    """Return a ReadObject request."""
     return Frame(Opcode.READ, (entry.index, (node << 8) | entry.sub))
 
 
 def write_request(entry: ObjectEntry, value: int, node: int) -> Frame:
-    """WriteObject.
+    """Return a WriteObject request.
 
     Raises:
         ValueError: ``value`` does not fit the object.
@@ -121,12 +121,12 @@ def write_request(entry: ObjectEntry, value: int, node: int) -> Frame:
 
 
 def segmented_read_request(entry: ObjectEntry, node: int) -> Frame:
-    """InitiateSegmentedRead: the segments follow with ``segment_request``."""
+    """Return an InitiateSegmentedRead request; ``segment_request`` then reads the segments."""
     return Frame(Opcode.INITIATE_SEGMENTED_READ, (entry.index, (node << 8) | entry.sub))
 
 
 def segment_request(toggle: bool) -> Frame:
-    """SegmentedRead: the next segment; the toggle bit alternates, first False."""
+    """Return a SegmentedRead request for the next segment; the toggle bit alternates, starting with False."""
     return Frame(Opcode.SEGMENTED_READ, (0x40 if toggle else 0,))
 
 

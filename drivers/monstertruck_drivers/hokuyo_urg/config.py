@@ -10,10 +10,10 @@ from monstertruck_drivers.scanning.config import ReturnsConfig, ScannerConfig
 
 
 class ScipConfig(ScannerConfig):
-    """How a scanner that speaks SCIP is driven; its geometry is always read from the sensor itself."""
+    """Driver settings of a SCIP scanner; the driver always reads the scan geometry from the sensor."""
 
     SERIES: ClassVar[tuple[str, ...]]
-    """Series names, one of which is part of the product or model name."""
+    """Supported series: the product or model name must contain one of these names."""
 
     serial_number: str | None = None
     """Serial number expected on this port (``SERI`` of VV); None: any."""

@@ -1,4 +1,4 @@
-"""The scanner as a service, and its session.
+"""Driver of Hokuyo scanners and its SCIP session.
 
 A session wakes the scanner from any state, identifies it, compares clocks and silences it; the driver streams scans in
 a session until it is cancelled or lost.
@@ -52,7 +52,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
 
 TRANSFER = 0.002
-"""Assumed time from the last beam to the arrival if it cannot be measured (s)."""
+"""Assumed time from the last beam to the arrival of its scan, if it cannot be measured (s)."""
 ANSWER_LIMIT = 2.0
 """Timeout for a complete answer, also over a slow RS232 line (s)."""
 
@@ -403,7 +403,7 @@ class HokuyoDriver(ScannerDriver[ScipConfig]):
             raise DeviceTimeoutError(f"{self._port.name}: no valid scan in time") from error
 
     def _decode(self, reply: Reply, shape: tuple[int, int, int], bad: int) -> ScanBlock | None:
-        """Parse the scan; None if it is damaged, which is reported unless ``bad`` others preceded it."""
+        """Parse a scan; None if it is damaged. The first damaged scan in a row (``bad`` 0) is reported."""
         try:
             return decode_scan(reply, *shape)
         except ProtocolError as error:
@@ -413,7 +413,7 @@ class HokuyoDriver(ScannerDriver[ScipConfig]):
             return None
 
     def _publish(self, block: ScanBlock, step_0: int, geometry: Parameters, received: int) -> None:
-        """Send one scan, its stamp moved from step 0 to the first beam."""
+        """Publish one scan, with its stamp moved from step 0 to the first beam."""
         config = self._config
         # A cluster's range is the minimum of its steps: it represents their middle.
         first = geometry.first_step + (config.cluster - 1) / 2
@@ -460,7 +460,7 @@ class HokuyoDriver(ScannerDriver[ScipConfig]):
 def split(
     values: NDArray[np.int32], geometry: Parameters, config: ScipConfig
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Ranges and codes of the values of a scan, as the scanner's series reports errors."""
+    """Split scan values into ranges and error codes, by the error values of the scanner's series."""
     if isinstance(config, HokuyoLxConfig):
         free = config.no_return == "free"
         return split_lx_ranges(values, geometry.least_mm, geometry.greatest_mm, free=free)
@@ -468,5 +468,5 @@ def split(
 
 
 def _sweep(geometry: Parameters) -> float:
-    """Seconds from step 0 to the last beam."""
+    """Time from step 0 to the last beam (s)."""
     return geometry.last_step * geometry.step_time

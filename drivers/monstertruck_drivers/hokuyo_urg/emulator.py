@@ -1,8 +1,8 @@
 """Device side of a URG-04LX, byte for byte: power-up state, both dialects, streaming, time, faults.
 
-Three tasks run forever: one reads request lines, one answers them a little later, and one is the rotor, which turns on
-a 100 ms grid of the sensor's clock with or without a client. A requested stream continues until QT, RS, its count or
-the supply ends it; a dying host changes nothing.
+Three tasks run forever: one reads request lines, one answers them after a delay, and one is the rotor, which turns
+every 100 ms of the sensor's clock with or without a client. A requested stream ends with QT, RS, its count or a loss of
+supply; it continues if the host dies.
 
 Where the specification is silent the emulator answers TM0 during a scan with 0A, MD during a stream with 0B,
 and everything but TM and RS in time-adjust mode with 0E.
@@ -106,7 +106,7 @@ def scan_lines(order: ScanOrder, counter: int, revolution: NDArray[np.int32]) ->
 
 
 def _strength(values: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Intensities of the returns for ranges (mm): decreasing with the distance."""
+    """Return intensities for ranges (mm); they fall with the distance."""
     bright = 4000  # intensity of a near white surface; it decreases with the distance
     fading = 6000  # distance that halves the intensity, mm
     return np.rint(bright / (1.0 + (np.maximum(values, 0) / fading) ** 2)).astype(np.int32)
@@ -134,12 +134,12 @@ StartState = Literal["scip1", "scip2", "streaming", "time_adjust"]
 ORDERED: Final = {"BM": "laser_on", "MD": "stream", "MS": "stream", "QT": "quit", "RS": "reset", "TM": "adjust"}
 """Requests that change the sensor's state, with the names of their signals."""
 RANGE: Final = "range"
-"""All distances of a scan, mm."""
+"""Signal: distances of a scan (mm)."""
 COUNTER: Final = "counter"
-"""Time stamp of a scan (ms)."""
+"""Signal: time stamp of a scan (ms)."""
 
 Handler = Callable[[str, str], tuple[str, list[bytes]]]
-"""Answers a request and its note by a status and lines."""
+"""Handler of a request and its tag; returns a status and lines."""
 Cover = Callable[[NDArray[np.int32]], NDArray[np.int32]]
 """Maps the values (n,) of the covered steps."""
 
@@ -148,13 +148,13 @@ class HokuyoEmulator(FaultyDevice):
     """Emulated scanner.
 
     Faults (``inject``): ``status N`` sends that status with the next revolution of a stream: 21-49 hold the stream
-    until 98, 50-97 end it. ``deaf`` ignores requests; ``fragile`` makes an unknown command cause that. ``cut`` ends the
-    next scan in the middle of a line. ``laser`` keeps the laser from lighting. ``seri`` puts a wrong sum on SERI and an
-    empty line into VV. ``tm`` makes it refuse its time-adjust mode. ``timer`` sets the counter, ``drift`` the rate of
-    its clock against the world's.
-    ``cover`` puts something over the window between two directions, degrees from straight ahead, left positive: the
-    beams, or a random share of them, give the value (below 20: an error code, otherwise mm). ``mirror`` puts a mirror
-    there: its middle dazzles, the rest shows the room behind the mirror, twice as far away.
+    until 98, 50-97 end it. ``deaf`` ignores requests; ``fragile``: an unknown command makes the sensor deaf. ``cut``
+    ends the next scan in the middle of a line. ``laser`` keeps the laser off. ``seri`` puts a wrong checksum on SERI
+    and an empty line into VV. ``tm`` makes the sensor refuse its time-adjust mode. ``timer`` sets the counter,
+    ``drift`` the rate error of the sensor's clock. ``cover`` covers the window between two directions (degrees from
+    straight ahead, left positive): the beams, or a random share of them, return the value (below 20: an error code,
+    otherwise mm). ``mirror`` puts a mirror there: its middle dazzles, the rest shows the room behind the mirror, twice
+    as far away.
 
     Args:
         clock: world time.
@@ -164,7 +164,7 @@ class HokuyoEmulator(FaultyDevice):
         state: initial state: freshly powered (SCIP 1.1), configured to start in SCIP 2.0, left streaming or
             in time-adjust mode by a dead host.
         serial: ``SERI`` of VV.
-        firmware: ``FIRM`` of VV; a major number below 3 knows SCIP 1.1 only.
+        firmware: ``FIRM`` of VV; a major version below 3 supports SCIP 1.1 only.
         timer_start: counter at construction (ms).
         drift_ppm: rate error of the sensor's clock; positive runs faster than the world.
         jitter: maximum delay of a scan by USB batching (s).
@@ -222,7 +222,7 @@ class HokuyoEmulator(FaultyDevice):
             },
         )
         self._elapsed = 0
-        """Sensor's time at ``_born`` (ns)."""
+        """Sensor time at ``_born`` (ns)."""
         self._covers: list[tuple[slice, Cover]] = []
         self._order: ScanOrder | None = None
         self._statuses: deque[int] = deque()
@@ -317,11 +317,11 @@ class HokuyoEmulator(FaultyDevice):
         self._timer_zero = self._time()
 
     def _time(self) -> int:
-        """Sensor's own time, ns since construction."""
+        """Sensor time (ns since construction)."""
         return self._elapsed + round((self._clock.now() - self._born) * self._rate)
 
     def _world_time(self, time: int) -> int:
-        """The world's time at a time of the sensor's clock (ns)."""
+        """World time at a sensor time (ns)."""
         return self._born + round((time - self._elapsed) / self._rate)
 
     def _counter(self, time: int) -> int:
@@ -532,7 +532,7 @@ class HokuyoEmulator(FaultyDevice):
         return self._qt(text, tag)
 
     def _cr(self, text: str, _tag: str) -> tuple[str, list[bytes]]:
-        """Its rotor has only one speed, the default."""
+        """Answer CR; the rotor has only its default speed."""
         return ("03" if text == "CR00" else "04"), []
 
     def _tm(self, text: str, _tag: str) -> tuple[str, list[bytes]]:
@@ -587,5 +587,5 @@ class HokuyoEmulator(FaultyDevice):
 
 
 def emulated(setup: EmulatorSetup) -> HokuyoEmulator:
-    """The lidar of a simulated truck."""
+    """Create the lidar of a simulated truck."""
     return HokuyoEmulator(setup.clock, setup.room, seed=setup.seed)

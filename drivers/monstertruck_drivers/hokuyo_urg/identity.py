@@ -1,4 +1,4 @@
-"""Ask a port what scanner is on it and take one scan."""
+"""Identify the scanner on a port and take one scan."""
 
 from dataclasses import asdict
 
@@ -24,7 +24,7 @@ async def identify(link: Link, clock: Clock, settings: ScipConfig) -> dict[str, 
         JSON-able: ``dialect``, ``identity``, ``parameters``, ``state`` and a summary of the ``scan``.
 
     Raises:
-        DeviceError: as the driver's ``run``.
+        DeviceError: see the driver's ``run``.
     """
     session = ScipSession(link, clock, settings)
     sensor = await session.handshake()

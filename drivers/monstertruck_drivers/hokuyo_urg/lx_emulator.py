@@ -1,8 +1,8 @@
 """Device side of a UST or UTM: SCIP 2.2 on a network socket.
 
-Unlike the URG-04LX it has neither SCIP 1.1 nor a baud rate, but scans with intensities, a state (``%ST``), a partial
-reset (``RT``) and a reboot (``RB``). The specification leaves open whether a stream ends with its connection; here it
-continues.
+Unlike the URG-04LX it has neither SCIP 1.1 nor a baud rate. It adds scans with intensities, a state (``%ST``), a
+partial reset (``RT``) and a reboot (``RB``). The specification leaves open whether a stream ends with its connection;
+here it continues.
 """
 
 import math
@@ -34,7 +34,7 @@ class BeamRanges:
         self._after = (steps * (model.period / model.steps_per_turn)).astype(np.int64)
 
     def scan(self, time_ns: int) -> NDArray[np.int32]:
-        """Values of the revolution that begins at an instant, shape (greatest step + 1,), mm or errors."""
+        """Values of the revolution that starts at ``time_ns`` (mm or errors), shape (greatest step + 1,)."""
         model = self._model
         ranges = self._source.beams(self._bearings, time_ns + self._after, model.ranges)
         values = np.where(np.isinf(ranges), model.unreturned, np.where(np.isnan(ranges), model.failed, 0))
@@ -53,7 +53,7 @@ class LxEmulator(HokuyoEmulator):
         source: source of the ranges.
         model: scanner model.
         seed: seed of the jitter.
-        options: as ``HokuyoEmulator``.
+        options: see ``HokuyoEmulator``.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class LxEmulator(HokuyoEmulator):
         return self._rs(text, tag)
 
     def _reboot(self, _text: str, _tag: str) -> tuple[str, list[bytes]]:
-        """Asked twice, for safety."""
+        """Reboot at the second of two consecutive requests."""
         if not self._rebooting:
             self._rebooting = True
             return "01", []
@@ -110,6 +110,6 @@ class LxEmulator(HokuyoEmulator):
 
 
 def emulated(setup: EmulatorSetup) -> LxEmulator:
-    """The lidar of a simulated robot."""
+    """Create the lidar of a simulated robot."""
     settings = setup.settings if isinstance(setup.settings, HokuyoLxConfig) else HokuyoLxConfig()
     return LxEmulator(setup.clock, setup.room, LX[settings.model], seed=setup.seed)

@@ -1,4 +1,4 @@
-"""Data sheets of the scanners, as their answer to PP and their emulators have them."""
+"""Data sheets of the scanners, for their answers to PP and their emulators."""
 
 from typing import Final, NamedTuple
 
@@ -17,9 +17,9 @@ class ScannerModel(NamedTuple):
     """``PROT`` of VV."""
     steps_per_turn: int
     first_step: int
-    """First step that measures."""
+    """First measuring step."""
     last_step: int
-    """Last step that measures."""
+    """Last measuring step."""
     greatest_step: int
     """Maximum step of a request."""
     front_step: int
@@ -27,17 +27,17 @@ class ScannerModel(NamedTuple):
     greatest_mm: int
     rpm: int
     unreturned: int
-    """Value of a beam that nothing returned."""
+    """Value of a beam without a return."""
     dazzled: int
-    """Value of a beam that came back too strongly."""
+    """Value of a beam with too strong a return."""
     failed: int
-    """Value of a measurement that failed."""
+    """Value of a failed measurement."""
     ranges: RangeSheet
-    """Ranges that it measures surely, and their errors."""
+    """Range limits and errors."""
 
     @property
     def period(self) -> int:
-        """Nanoseconds of one revolution, of the sensor's clock."""
+        """Revolution period of the sensor's clock (ns)."""
         return 60_000_000_000 // self.rpm
 
 
@@ -68,4 +68,4 @@ LX: Final = {
         "SOKUIKI Sensor UTM-30LX-EW", "UTM-30LX-EW", 23, 60000, (1, 5), RangeSheet(0.1, 30.0, 0.03, 0.005 / 3)
     ),
 }
-"""Models of the series UST and UTM: 1081 steps over 270 degrees, 40 revolutions a second."""
+"""Models of the series UST and UTM: 1081 steps over 270 degrees, 40 revolutions per second."""

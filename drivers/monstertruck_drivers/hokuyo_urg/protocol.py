@@ -19,7 +19,7 @@ from monstertruck_runtime.errors import ProtocolError
 from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM
 
 ScanFormat = Literal["MD", "MS"]
-"""Three characters a range (up to 262143 mm) or two (up to 4095 mm)."""
+"""Three characters per range (up to 262143 mm) or two (up to 4095 mm)."""
 
 RANGE_WIDTH: Final[dict[str, int]] = {"MD": 3, "GD": 3, "ME": 3, "GE": 3, "MS": 2, "GS": 2, "G": 2}
 """Characters of one range, and of one intensity, by command."""
@@ -31,7 +31,7 @@ LINE_PAYLOAD: Final = 64
 TAG_LIMIT: Final = 16
 """Maximum length of the echoed string after ``;``."""
 UNRETURNED: Final = 65533
-"""Value of a UST's beam that nothing returned."""
+"""Value of a UST's beam without a return."""
 MAX_REPLY: Final = 8192
 """Bytes kept while waiting for the end of a reply; the longest real one (1081 ranges with intensities) has 6700."""
 
@@ -45,7 +45,7 @@ def line_sum(text: bytes) -> int:
 
 
 def sum_matches(line: bytes) -> bool:
-    """Whether ``line`` (with its checksum character) is intact; a ``;`` before the sum may count or not."""
+    """Whether ``line`` (with its checksum character) is intact; the checksum may include a ``;`` before it or not."""
     text, check = line[:-1], line[-1:]
     if not check:
         return False
@@ -53,7 +53,7 @@ def sum_matches(line: bytes) -> bool:
 
 
 def encode(value: int, width: int) -> bytes:
-    """``value`` as ``width`` characters of six bits each, most significant first.
+    """Encode ``value`` as ``width`` characters of six bits each, most significant first.
 
     Raises:
         ValueError: it does not fit.
@@ -78,7 +78,7 @@ def decode(text: bytes) -> int:
 
 
 def encode_array(values: NDArray[np.integer], width: int) -> bytes:
-    """Shape (n,) to ``n * width`` characters; bits that do not fit are cut."""
+    """Encode an array of shape (n,) as ``n * width`` characters; bits that do not fit are cut off."""
     shifts = np.arange(6 * (width - 1), -1, -6)
     return ((values[:, None] >> shifts & 0x3F) + 0x30).astype(np.uint8).tobytes()
 
@@ -87,11 +87,11 @@ def decode_array(payload: bytes, width: int) -> NDArray[np.int32]:
     """Inverse of :func:`encode_array`.
 
     Raises:
-        ProtocolError: a character outside ``0`` to ``o``, or a number cut short.
+        ProtocolError: a character outside ``0`` to ``o``, or a truncated number.
     """
     if len(payload) % width:
         raise ProtocolError(f"SCIP: {len(payload)} characters are not a whole number of {width}-character ranges")
-    digits = np.frombuffer(payload, np.uint8) - np.uint8(0x30)  # too small a byte wraps to a great one
+    digits = np.frombuffer(payload, np.uint8) - np.uint8(0x30)  # a byte below 0x30 wraps to a large value
     if digits.size and digits.max() > 0x3F:
         raise ProtocolError("SCIP: byte outside the encoding in a data line")
     columns = digits.reshape(-1, width).astype(np.int32)
@@ -102,13 +102,13 @@ def decode_array(payload: bytes, width: int) -> NDArray[np.int32]:
 
 
 def wrap_lines(payload: bytes, *, sums: bool = True) -> list[bytes]:
-    """Cut ``payload`` into data lines, without their LF, with checksum characters if ``sums``."""
+    """Split ``payload`` into data lines without LF, with checksum characters if ``sums``."""
     lines = [payload[at : at + LINE_PAYLOAD] for at in range(0, len(payload), LINE_PAYLOAD)]
     return [line + bytes((line_sum(line),)) for line in lines] if sums else lines
 
 
 def unwrap_lines(lines: list[bytes], *, sums: bool = True) -> bytes:
-    """Join data lines again, checking their sums.
+    """Join data lines and verify their checksums.
 
     Raises:
         ProtocolError: a line with a wrong sum or more than 64 payload characters.
@@ -128,7 +128,7 @@ def unwrap_lines(lines: list[bytes], *, sums: bool = True) -> bytes:
 
 
 def request(command: str, tag: str = "") -> bytes:
-    """Wire form of a command, with an optional string that the sensor echoes.
+    """Encode a command, with an optional tag that the sensor echoes.
 
     Raises:
         ValueError: characters the sensor would refuse, or too long a tag.
@@ -142,7 +142,7 @@ def request(command: str, tag: str = "") -> bytes:
 
 
 def scan_command(scan_format: ScanFormat, start: int, end: int, cluster: int = 1, skip: int = 0, count: int = 0) -> str:
-    """``MD``/``MS``: steps ``start`` to ``end``, ``skip`` revolutions left out between two; count 0 = endless.
+    """``MD`` or ``MS`` for steps ``start`` to ``end``; ``skip`` revolutions between two scans; count 0 = endless.
 
     Raises:
         ValueError: a parameter outside its digits.
@@ -152,7 +152,7 @@ def scan_command(scan_format: ScanFormat, start: int, end: int, cluster: int = 1
 
 
 def scip1_scan_command(start: int, end: int, cluster: int = 1) -> str:
-    """``G`` of SCIP 1.1: the latest revolution, once.
+    """``G`` (SCIP 1.1), which requests the latest revolution once.
 
     Raises:
         ValueError: a parameter outside its digits.
@@ -192,7 +192,7 @@ class Reply:
 
 
 def build_reply(echo: str, status: str, lines: list[bytes] | None = None) -> bytes:
-    """Wire form of a reply; ``lines`` carry their own checksum characters."""
+    """Encode a reply; ``lines`` carry their own checksum characters."""
     head = status.encode("ascii")
     if len(status) > 1:
         head += bytes((line_sum(head),))
@@ -200,26 +200,26 @@ def build_reply(echo: str, status: str, lines: list[bytes] | None = None) -> byt
 
 
 _ECHO = rb"(?:VV|PP|II|BM|QT|RS|TM[012]|SS\d{6}|SCIP2\.0|G[DES]\d{10}|M[DES]\d{13}|V|L[01]|G\d{8})"
-# Not tied to the start of a line: it may be glued to one that was cut.
+# Not anchored at the start of a line: the header may directly follow a truncated line.
 _HEADER = re.compile(_ECHO + rb"\n(?:[0-9A-Z]{2}[0-o]|[0-9A-Z])\n")
 _FIRST_LINES = re.compile(rb"([\x20-\x7e]{1,64})\n(?:([0-9A-Z]{2})([0-o])|([0-9A-Z]))\n")
 _TEXT_LINE = re.compile(rb"[A-Z]{4}:")
 
 
 class ScipParser:
-    """Incremental reader of replies that finds its way again after lost, flipped or foreign bytes."""
+    """Incremental parser of replies; it resynchronises after lost, flipped or foreign bytes."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
         self._searched = 0
         self._last = Reply("", "", [])
         self.replies = 0
-        """Replies recognised so far."""
+        """Number of replies recognised."""
         self.rejected = 0
-        """Runs of bytes without a readable header so far."""
+        """Number of byte runs without a readable header."""
 
     def feed(self, data: bytes) -> list[Reply]:
-        """Take received bytes in pieces of any size; returns the replies completed by them."""
+        """Parse received bytes in chunks of any size; return the completed replies."""
         self._buffer += data
         found: list[Reply] = []
         while (at := self._buffer.find(b"\n\n", self._searched)) >= 0:
@@ -235,12 +235,12 @@ class ScipParser:
         return found
 
     def reset(self) -> None:
-        """Forget a reply that is half received."""
+        """Discard a partially received reply."""
         self._buffer.clear()
         self._searched = 0
 
     def _read(self, group: bytes) -> list[Reply]:
-        """Replies in the text up to an empty line: one, or more where an end was lost."""
+        """Parse the text up to an empty line: one reply, or several if the end of one was lost."""
         if not group:
             return []
         starts = [match.start() for match in _HEADER.finditer(group)]
@@ -270,7 +270,7 @@ class StatusMeaning(Enum):
 
     OK = auto()
     ALREADY = auto()
-    """Nothing to do: the laser was on, the mode was entered or left before."""
+    """Nothing to do: the laser was already on, or the mode already entered or left."""
     DATA = auto()
     """A scan follows."""
     VERIFYING = auto()
@@ -286,11 +286,11 @@ class StatusMeaning(Enum):
     FAULT = auto()
     """50-97, 0A, 0L, or a laser that failed to light."""
     BAD_REQUEST = auto()
-    """Our own mistake: retrying cannot help."""
+    """Invalid request of this driver; a retry cannot help."""
 
 
 def classify(command: str, status: str) -> StatusMeaning:
-    """Judge ``status`` of the reply to ``command`` (its first characters suffice)."""
+    """Classify the ``status`` of a reply to ``command`` (its first characters suffice)."""
     if len(status) == 1:
         return StatusMeaning.OK if status == "0" else StatusMeaning.BAD_REQUEST
     shared = {
@@ -334,11 +334,11 @@ class ScanBlock:
     counter: int | None
     """Millisecond counter at step 0, 24 bits; None in SCIP 1.1."""
     values: NDArray[np.int32]
-    """Shape (n,): mm, or an error code where below the sensor's least range."""
+    """Ranges (mm), shape (n,); a value below the sensor's minimum range is an error code."""
 
 
 def decode_counter(line: bytes) -> int:
-    """Millisecond counter from a time line with its checksum.
+    """Parse the millisecond counter of a time line with its checksum.
 
     Raises:
         ProtocolError: wrong sum or length.
@@ -351,10 +351,10 @@ def decode_counter(line: bytes) -> int:
 def decode_scan(reply: Reply, start: int, end: int, cluster: int = 1) -> ScanBlock:
     """Decode the block of a scan of steps ``start`` to ``end``.
 
-    A partial last cluster may be there or not: the specification leaves it open.
+    The last, partial cluster may be present or absent: the specification leaves it open.
 
     Raises:
-        ProtocolError: wrong sums, or another number of ranges than was requested.
+        ProtocolError: a wrong checksum, or a number of ranges other than requested.
     """
     name = reply.echo[:1] if reply.scip1 else reply.echo[:2]
     if name not in RANGE_WIDTH or (not reply.scip1 and len(reply.lines) < 2):
@@ -376,7 +376,7 @@ def split_ranges(values: NDArray[np.int32], least: int) -> tuple[NDArray[np.floa
         least: minimum range (mm, ``DMIN``); lower values are error codes.
 
     Returns:
-        Ranges in m, +inf where invalid, and codes, 255 where valid; both shape (n,), read-only as messages have them.
+        Ranges in m, +inf where invalid, and codes, 255 where valid; both shape (n,), read-only for use in messages.
     """
     valid = values >= least
     ranges = np.where(valid, values / 1000.0, np.inf)
@@ -388,7 +388,7 @@ def split_ranges(values: NDArray[np.int32], least: int) -> tuple[NDArray[np.floa
 def split_lx_ranges(
     values: NDArray[np.int32], least: int, greatest: int, *, free: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Like ``split_ranges``, for the series UST and UTM, whose values outside their range are errors.
+    """Like ``split_ranges``, for the series UST and UTM: values outside their range are errors.
 
     A UTM reports 1 where nothing is in range (table 4 of the SCIP 2.0 specification), a UST a value beyond its range.
     Their other errors carry no information.
@@ -427,28 +427,28 @@ class Parameters:
 
     model: str
     least_mm: int
-    """Values below are error codes."""
+    """Minimum valid range (mm); values below it are error codes."""
     greatest_mm: int
     steps_per_turn: int
     first_step: int
-    """First step that measures."""
+    """First measuring step."""
     last_step: int
     front_step: int
-    """Step that looks straight ahead."""
+    """Step that points straight ahead."""
     rpm: int
 
     @property
     def period(self) -> float:
-        """Seconds of one revolution."""
+        """Revolution period (s)."""
         return 60.0 / self.rpm
 
     @property
     def step_time(self) -> float:
-        """Seconds between neighbouring steps."""
+        """Time between neighbouring steps (s)."""
         return self.period / self.steps_per_turn
 
     def angle(self, step: float) -> float:
-        """Direction of a step, rad, counter-clockwise from straight ahead."""
+        """Direction of a step (rad), counter-clockwise from straight ahead."""
         return (step - self.front_step) * 2.0 * math.pi / self.steps_per_turn
 
 
@@ -460,22 +460,22 @@ class InternalState:
     speed: str
     mode: str
     counter: int
-    """Milliseconds, 24 bits."""
+    """Millisecond counter, 24 bits."""
     status: str
 
 
 SCIP1_PARAMETERS: Final = Parameters("URG-04LX", 20, 4095, 1024, 44, 725, 384, 600)
-"""URG-04LX of firmware below 3, which has no PP to ask; 4095 mm is the most its encoding holds."""
+"""Parameters of a URG-04LX with firmware below 3, which has no PP; 4095 mm is the maximum of its encoding."""
 
 
 def parse_fields(lines: list[bytes], *, sums: bool = True) -> dict[str, str]:
     """Parse ``KEY:value;`` lines into a mapping.
 
-    A wrong sum on SERI is accepted (some units send it), and a sum that leaves out the text after ``<-`` (II of some
-    models).
+    Accepts a wrong checksum of SERI, which some units send, and a checksum that excludes the text after ``<-`` (II of
+    some models).
 
     Raises:
-        ProtocolError: another line has a wrong sum, or a line has another form.
+        ProtocolError: any other line has a wrong checksum, or a line is malformed.
     """
     fields: dict[str, str] = {}
     for line in lines:
@@ -493,7 +493,7 @@ def parse_fields(lines: list[bytes], *, sums: bool = True) -> dict[str, str]:
 
 
 def build_fields(fields: Mapping[str, str | int]) -> list[bytes]:
-    """Lines ``KEY:value;`` as firmware 3.1 sends them: the ``;`` is left out of the sum."""
+    """Build lines ``KEY:value;`` as firmware 3.1 does: the checksum excludes the ``;``."""
     lines = []
     for key, value in fields.items():
         text = f"{key}:{value}".encode("latin-1")
@@ -502,15 +502,15 @@ def build_fields(fields: Mapping[str, str | int]) -> list[bytes]:
 
 
 def parse_identity(fields: dict[str, str]) -> LidarIdentity:
-    """Fields of VV; a missing one is empty, as old units leave some out."""
+    """Parse the fields of VV; missing ones are empty, because old units omit some."""
     return LidarIdentity(*(fields.get(key, "") for key in ("VEND", "PROD", "FIRM", "PROT", "SERI")))
 
 
 def parse_parameters(fields: dict[str, str]) -> Parameters:
-    """Fields of PP.
+    """Parse the fields of PP.
 
     Raises:
-        ProtocolError: a field is missing, no number, or the geometry is impossible.
+        ProtocolError: a field is missing or not a number, or the geometry is impossible.
     """
     try:
         numbers = [int(fields[key]) for key in ("DMIN", "DMAX", "ARES", "AMIN", "AMAX", "AFRT", "SCAN")]
@@ -528,7 +528,7 @@ def parse_parameters(fields: dict[str, str]) -> Parameters:
 
 
 def parse_state(fields: dict[str, str]) -> InternalState:
-    """Fields of II.
+    """Parse the fields of II.
 
     Raises:
         ProtocolError: no hexadecimal TIME.

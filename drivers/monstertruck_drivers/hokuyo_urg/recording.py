@@ -1,4 +1,4 @@
-"""A recorded drive served by the emulated scanner, every scan at its recorded time, once."""
+"""Replay of a recorded drive by the emulated scanner: every scan once, at its recorded time."""
 
 import asyncio
 from pathlib import Path
@@ -18,7 +18,7 @@ STEPS: Final = range(43, 726)
 
 
 class RecordedRanges:
-    """Scans of a recorded drive; a ``RangeSource`` once :meth:`start` has set when it begins.
+    """Scans of a recorded drive; a ``RangeSource`` after :meth:`start` has set its start time.
 
     Args:
         times: shape (n,), ns since the first scan, increasing: step 0 of each revolution.
@@ -37,7 +37,8 @@ class RecordedRanges:
     def load(cls, path: Path) -> Self:
         """Read the text format of the BreezySLAM examples, gzipped or not.
 
-        One scan a line of 707 blank-separated numbers: column 0 time in microseconds, 24..706 ranges in mm.
+        Each line is one scan of 707 blank-separated numbers: column 0 is the time in microseconds, 24..706 are ranges
+        in mm.
 
         Raises:
             InputError: the file does not exist or a line is not of this form.
@@ -57,11 +58,11 @@ class RecordedRanges:
         return cls((np.array(times, np.int64) - times[0]) * 1000, np.array(rows, np.int32))
 
     def start(self, time_ns: int) -> None:
-        """Let step 0 of the first scan be at ``time_ns``."""
+        """Start the recording: step 0 of the first scan is at ``time_ns``."""
         self._begin = time_ns
 
     def scan(self, time_ns: int) -> NDArray[np.int32]:
-        """The recorded revolution that began nearest to ``time_ns``; shape (769,), zero where not recorded."""
+        """Return the recorded revolution that started nearest to ``time_ns``; shape (769,), zero where not recorded."""
         at = int(np.searchsorted(self.times, time_ns - self._begin))
         near = [i for i in (at - 1, at) if 0 <= i < len(self.times)]
         best = min(near, key=lambda i: abs(int(self.times[i]) - (time_ns - self._begin)))
@@ -81,14 +82,14 @@ def _parse(line: str, where: str) -> tuple[int, NDArray[np.int32]]:
         time, row = int(words[time_column]), np.array(words[first_range_column:], np.int64)
     except ValueError as error:
         raise InputError(f"{where}: expected whole numbers: {error}") from error
-    greatest = (1 << 18) - 1  # most that three characters hold, mm
+    greatest = (1 << 18) - 1  # maximum of three characters, mm
     if row.min() < 0 or row.max() > greatest:
         raise InputError(f"{where}: expected ranges within 0..{greatest} mm")
     return time, row.astype(np.int32)
 
 
 class RecordedHokuyoEmulator(HokuyoEmulator):
-    """Scanner that turns at the recorded times; reports steps 43..725 like the recorded scanner.
+    """Scanner whose revolutions start at the recorded times; it reports steps 43..725 like the recorded scanner.
 
     The first request for a stream starts the recording, which then plays once, with or without a client.
 
@@ -97,7 +98,7 @@ class RecordedHokuyoEmulator(HokuyoEmulator):
         recording: scans and their times.
         seed: seed of the USB jitter.
         state: initial state; ``streaming`` starts the recording at once.
-        options: others of ``HokuyoEmulator``.
+        options: further options of ``HokuyoEmulator``.
     """
 
     def __init__(
@@ -106,7 +107,7 @@ class RecordedHokuyoEmulator(HokuyoEmulator):
         self.finished = asyncio.Event()
         """Set once the last recorded scan was sent."""
         self.began: int | None = None
-        """The world's time, ns, at step 0 of the first recorded scan."""
+        """World time at step 0 of the first recorded scan (ns)."""
         self._recording = recording
         self._wanted = asyncio.Event()
         self._first = 0
@@ -119,7 +120,7 @@ class RecordedHokuyoEmulator(HokuyoEmulator):
     async def _next_revolution(self, previous: int | None) -> int | None:
         if previous is None:
             await self._wanted.wait()
-            lead = 10_000_000  # nanoseconds from the request for scans to step 0 of the first recorded one
+            lead = 10_000_000  # nanoseconds from the scan request to step 0 of the first recorded scan
             self._first = self._time() + lead
             self._recording.start(self._first)
             self.began = self._world_time(self._first)

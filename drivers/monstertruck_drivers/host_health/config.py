@@ -14,33 +14,33 @@ Bytes = Annotated[int, Field(ge=0)]
 
 
 class HostHealthConfig(Schema):
-    """When the computer is in need; every ``..._clear`` is where that ends again."""
+    """Limits of the computer's load and resources; each ``..._clear`` value ends the shortage."""
 
     kind: Literal["host_health"] = "host_health"
     rate: Annotated[float, Field(gt=0, le=10)] = 1.0
     """Checks per second"""
     after: Seconds = 3.0
-    """Seconds beyond a limit before it is reported"""
+    """Time beyond a limit before it is reported (s)"""
     hot: Celsius = 80.0
-    """Degree Celsius of the hottest thermal zone"""
+    """Temperature limit of the hottest thermal zone (degrees Celsius)"""
     hot_clear: Celsius = 75.0
-    """Temperature below which the heat has ended (degrees Celsius)."""
+    """Temperature below which the overheating ends (degrees Celsius)."""
     busy: Share = 0.95
-    """Busy share of all cores"""
+    """Limit of the busy fraction of all cores"""
     busy_clear: Share = 0.85
-    """Busy share below which the load has ended."""
+    """Busy fraction below which the overload ends."""
     busy_after: Seconds = 10.0
-    """Like ``after``, for a busy processor: planning may use all of it for a while"""
+    """Time above ``busy`` before it is reported (s): planning may use the whole processor for a while"""
     slow: Share = 0.8
     """Limit for the allowed clock, as a fraction of the maximum clock; lower it where a cap is intended"""
     memory: Share = 0.1
-    """Available share of the memory"""
+    """Minimum available fraction of the memory"""
     memory_clear: Share = 0.15
-    """Available share above which the shortage of memory has ended."""
+    """Available fraction above which the shortage of memory ends."""
     disk: Bytes = 1_000_000_000
-    """Free bytes of the file system that holds ``disk_path``"""
+    """Minimum free space of the file system that holds ``disk_path`` (bytes)"""
     disk_clear: Bytes = 1_500_000_000
-    """Free bytes above which the shortage of disk space has ended."""
+    """Free space above which the shortage of disk space ends (bytes)."""
     disk_path: Path = Path("runs")
     """Folder of the logs; it need not exist yet"""
 

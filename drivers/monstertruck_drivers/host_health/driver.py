@@ -14,11 +14,11 @@ from monstertruck_schemas.health import HostHealth
 from monstertruck_schemas.reasons import Reason
 
 SEVERITIES: Final = {Reason.DISK_LOW: Severity.ERROR, Reason.MEMORY_LOW: Severity.ERROR}
-"""The others are warnings."""
+"""Severities other than WARNING."""
 
 
 class HostHealthDriver:
-    """Publishes the computer's health, and reports each limit when it is passed and when it recovers.
+    """Publishes the computer's health, and reports each shortage when it starts and when it ends.
 
     Args:
         config: limits.
@@ -56,11 +56,11 @@ class HostHealthDriver:
         }
 
     async def run(self, ready: Ready) -> None:
-        """Look until cancelled.
+        """Sample until cancelled.
 
         Raises:
-            DeviceError: /proc cannot be read, or the disk cannot be asked.
-            ProtocolError: /proc is not as documented.
+            DeviceError: /proc cannot be read, or the free space of the disk is unknown.
+            ProtocolError: /proc differs from its documentation.
         """
         schedule = Schedule(self._clock, self._config.rate, Lead.IN_THREADS)
         while True:

@@ -45,7 +45,7 @@ class HostEmulator(FaultyDevice):
         self.write()
 
     async def run(self) -> None:
-        """Let time pass until cancelled."""
+        """Update the files until cancelled."""
         write_period = 0.5  # seconds between two writes
         while True:
             await self._clock.sleep(write_period)
@@ -66,7 +66,7 @@ class HostEmulator(FaultyDevice):
         self._throttled += 1
 
     def write(self) -> None:
-        """Bring all files up to date, each at once and whole."""
+        """Update all files, each atomically."""
         idle = self._ticks - self._busy_ticks
         rows = [f"cpu  {self._busy_ticks} 0 0 {idle} 0 0 0 0 0 0"]
         rows += [f"cpu{core} {self._busy_ticks // CORES} 0 0 {idle // CORES} 0 0 0 0 0 0" for core in range(CORES)]
@@ -97,5 +97,5 @@ class HostEmulator(FaultyDevice):
 
 
 def emulated(setup: EmulatorSetup) -> HostEmulator:
-    """The files of a simulated truck's computer."""
+    """Create the files of a simulated truck's computer."""
     return HostEmulator(setup.root, setup.clock)

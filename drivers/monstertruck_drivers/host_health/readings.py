@@ -1,4 +1,4 @@
-"""Readings of the computer's health in /proc and /sys; blocks for as long as reading small files takes.
+"""Read the computer's health from /proc and /sys; blocks while it reads small files.
 
 Source: kernel documentation, proc(5), ABI/testing/sysfs-class-thermal, admin-guide/pm/cpufreq, and for the throttle
 counters of x86 ABI/testing/sysfs-devices-system-cpu. ``get_throttled`` is the Raspberry Pi firmware's word: bits 0
@@ -34,13 +34,13 @@ class Reading:
     cores: int
     times: Times
     temperature: float | None
-    """Degree Celsius, hottest zone."""
+    """Temperature of the hottest zone (degrees Celsius)."""
     frequency: float | None
-    """Hz, fastest core."""
+    """Clock of the fastest core (Hz)."""
     frequency_share: float | None
-    """Allowed over possible clock of the core that is held back most."""
+    """Ratio of allowed to maximum clock of the most limited core."""
     throttle_events: int
-    """Times the processor was too hot since the start."""
+    """Number of thermal throttle events since the start."""
     firmware_throttled: bool
     memory_total: int
     memory_available: int
@@ -81,10 +81,10 @@ def read_host(root: Path, disk: Disk) -> Reading:
 
 
 def parse_stat(text: str) -> tuple[int, Times]:
-    """Cores and processor times of /proc/stat; waiting for a disk counts as idle.
+    """Parse the cores and processor times of /proc/stat; waiting for a disk counts as idle.
 
     Raises:
-        ProtocolError: no line ``cpu``, or too short.
+        ProtocolError: the line ``cpu`` is missing or too short.
     """
     lines = [line.split() for line in text.splitlines() if line.startswith("cpu")]
     try:
@@ -99,7 +99,7 @@ def parse_stat(text: str) -> tuple[int, Times]:
 
 
 def parse_meminfo(text: str) -> tuple[int, int]:
-    """Total and available bytes of /proc/meminfo.
+    """Parse the total and available bytes of /proc/meminfo.
 
     Raises:
         ProtocolError: a row is missing.
@@ -117,7 +117,7 @@ def parse_meminfo(text: str) -> tuple[int, int]:
 
 
 def busy_share(before: Times, now: Times) -> float | None:
-    """Share of the processor time between two readings that was busy; None if no time passed."""
+    """Fraction of the processor time between two readings that was busy; None if no time passed."""
     total = now.total - before.total
     return min(max((now.busy - before.busy) / total, 0.0), 1.0) if total > 0 else None
 

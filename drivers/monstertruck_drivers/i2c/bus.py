@@ -25,7 +25,7 @@ class I2cMessages(ctypes.Structure):
 
 
 def limit_waits(bus: int) -> None:
-    """Limit the time for which the adapter waits for a device that holds the clock.
+    """Limit how long the adapter waits for a device that stretches the clock.
 
     Raises:
         OSError: not an I2C bus.

@@ -48,7 +48,7 @@ class I2cBus:
         return answer.data
 
     def send(self, address: int, data: bytes) -> None:
-        """Write ``data`` without waiting for the result, as the last words of a session.
+        """Write ``data`` without waiting for the result, as at the end of a session.
 
         Raises:
             DeviceLostError: the bus is gone.

@@ -1,4 +1,4 @@
-"""Buses of the kernel: transfers run in a thread of the bus, because a device may hold the clock."""
+"""Buses of the kernel. Each has a thread for its transfers, because a device may stretch the clock."""
 
 import asyncio
 import errno

@@ -61,7 +61,7 @@ HEADS: Final[dict[type, tuple[int, int]]] = {I2cRequest: (REQUEST_MARK, 5), I2cA
 
 @dataclass(slots=True)
 class Packets(Generic[P]):
-    """Incremental parser of one direction; skips what is damaged.
+    """Incremental parser of one direction; skips damaged bytes.
 
     Args:
         kind: ``I2cRequest`` or ``I2cAnswer``.
@@ -96,7 +96,9 @@ def _sealed(packet: bytes) -> bytes:
 
 
 Transfer = Callable[[int, bytes, int], bytes | None]
-"""Takes address, bytes written and number of bytes to read; returns them, or None if no device acknowledges."""
+"""Transfer function: takes the address, the bytes to write and the number of bytes to read; returns the bytes read, or
+None if no device acknowledges.
+"""
 
 
 async def serve(end: DeviceEnd, transfer: Transfer) -> None:

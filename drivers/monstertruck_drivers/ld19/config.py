@@ -8,11 +8,11 @@ from monstertruck_drivers.scanning.config import TurningHeadConfig
 
 
 class Ld19Config(TurningHeadConfig):
-    """LDROBOT LD06, LD19 or STL-19P: streams from power-up on; nothing can be set over its cable."""
+    """LDROBOT LD06, LD19 or STL-19P: it streams from power-up and accepts no settings over its cable."""
 
     kind: Literal["ld19"] = "ld19"
     model: Literal["ld06", "ld19", "stl19p"] = "ld19"
-    """Which one it is: they send the same, but reach and measure differently"""
+    """Model: all send the same packets, but differ in range and accuracy"""
 
     @property
     def sheet(self) -> RangeSheet:

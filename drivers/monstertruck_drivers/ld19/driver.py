@@ -1,4 +1,4 @@
-"""Driver of the LD19: listens, and publishes every revolution."""
+"""Driver of the LD19: receives its stream and publishes every revolution."""
 
 import numpy as np
 
@@ -33,13 +33,13 @@ def packet_stream(link: Link, clock: Clock) -> DeviceStream[Ld19Packet]:
 
 
 async def first_packets(stream: DeviceStream[Ld19Packet]) -> list[Ld19Packet]:
-    """Wait for the first packets of a session; raises as ``DeviceStream.first``."""
-    listen = 1.5  # seconds to find a packet of a unit that was powered just now; it is silent for half a second
+    """Wait for the first packets of a session; raises the errors of ``DeviceStream.first``."""
+    listen = 1.5  # seconds to receive a packet at the start; a unit is silent for half a second after power-up
     return await stream.first(listen, "of an LD19: another device, or another baud rate")
 
 
 class PacketSamples:
-    """BeamSamples of packets, on the unit's own clock since the session began."""
+    """Converts packets to ``BeamSamples``, timed by the unit's clock since the start of the session."""
 
     def __init__(self) -> None:
         self.elapsed = 0
@@ -47,13 +47,15 @@ class PacketSamples:
         self._stamp: int | None = None
 
     def of(self, packets: list[Ld19Packet]) -> BeamSamples:
-        """Return the samples of consecutive packets; packets of a stationary head are left out."""
+        """Return the samples of consecutive packets, without those of a stationary head."""
         kept, ends = [], []
         for packet in packets:
             if self._stamp is not None:
                 self.elapsed += (packet.stamp - self._stamp) % STAMP_TURN * 1_000_000
             self._stamp = packet.stamp
-            widest = FULL_TURN // 4  # angle that no packet covers, 0.01 degrees: a damaged one, or a head that starts
+            widest = (
+                FULL_TURN // 4
+            )  # maximum angle without a packet (0.01 degrees): a damaged packet, or a head that starts
             if packet.speed and 0 < packet.span < widest:
                 kept.append(packet)
                 ends.append(self.elapsed)
@@ -81,9 +83,9 @@ class Ld19Driver(ScannerDriver[Ld19Config]):
 
         Raises:
             DeviceLostError: unplugged.
-            DeviceTimeoutError: silence, a head that does not turn, or scans that arrive late for seconds.
+            DeviceTimeoutError: silence, a stationary head, or scans that arrive late for seconds.
             ProtocolError: bytes without a packet.
-            WrongDeviceError: nothing that comes at the start is of an LD19.
+            WrongDeviceError: the bytes at the start contain no packet of an LD19.
             PortBusyError: another process holds the port.
         """
         config, sheet = self._config, MODELS[self._config.model].ranges
@@ -121,7 +123,7 @@ async def identify(link: Link, clock: Clock, settings: Ld19Config) -> dict[str, 
         JSON-able: ``turns_per_second``, ``stamp_ms``, ``ranges_m``.
 
     Raises:
-        DeviceError: as the driver's ``run``.
+        DeviceError: see the driver's ``run``.
     """
     packet = (await first_packets(packet_stream(link, clock)))[-1]
     return {

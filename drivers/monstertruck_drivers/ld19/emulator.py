@@ -1,4 +1,4 @@
-"""The device side of an LD19, byte for byte: silent after power-up, its head comes up to speed, packets without end."""
+"""Device side of an LD19, byte for byte: silent after power-up, then spinning up, then streaming packets."""
 
 import asyncio
 from typing import Final
@@ -25,13 +25,13 @@ from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
 
 RANGE: Final = "range"
-"""Distances of a packet, mm."""
+"""Signal: distances of a packet (mm)."""
 COUNTER: Final = "counter"
-"""Time stamp (ms)."""
+"""Signal: time stamp (ms)."""
 
 
 class Ld19Emulator(FaultyDevice):
-    """LD06, LD19 or STL-19P that streams from power-up on.
+    """LD06, LD19 or STL-19P that streams from power-up.
 
     Faults (``inject``): ``silent on|off``, ``bad_crc N`` (the next N packets), ``half_packet``, and the faults of
     the head.
@@ -46,7 +46,7 @@ class Ld19Emulator(FaultyDevice):
     def __init__(self, clock: Clock, source: BeamSource, sheet: ModelSheet = MODELS["ld19"], *, seed: int = 0) -> None:
         self.name = "lidar"
         self.received = ReceivedBytes()
-        """Bytes the host sent, for tests: it takes no notice of any."""
+        """Bytes the host sent, for tests; the unit ignores them."""
         rng = np.random.default_rng(seed)
         kinds = {RANGE: SignalKind.ARRAY, COUNTER: SignalKind.NUMBER}
         self.signals = Signals(clock.now, kinds, rng, codes={RANGE: 1})
@@ -74,7 +74,7 @@ class Ld19Emulator(FaultyDevice):
                 self.received.extend(await end.read())
 
     def power_cycle(self) -> None:
-        """Supply off and on: its clock starts at 0, its head stands."""
+        """Switch the supply off and on: the clock starts at 0, the head is stationary."""
         self.head.stop()
         self.faults["half_packet"] = 1
         self._powered_at = self.head.now()
@@ -85,7 +85,7 @@ class Ld19Emulator(FaultyDevice):
             times = (begin + self._period * np.arange(1, POINTS + 1)).astype(np.int64)
             last = int(times[-1])
             await self._clock.sleep_until(self.head.world_time(last))
-            # Nanoseconds that it lags behind after the host's machine slept, at most; older packets are lost.
+            # Maximum lag after the host's machine slept (ns); older packets are lost.
             overslept = 5 * SECOND // 10
             late = self.head.now() - last > overslept
             begin = float(self.head.now() if late else begin + self._period * POINTS)
@@ -116,6 +116,6 @@ class Ld19Emulator(FaultyDevice):
 
 
 def emulated(setup: EmulatorSetup) -> Ld19Emulator:
-    """The lidar of a simulated robot."""
+    """Create the lidar of a simulated robot."""
     settings = setup.settings if isinstance(setup.settings, Ld19Config) else Ld19Config()
     return Ld19Emulator(setup.clock, setup.room, MODELS[settings.model], seed=setup.seed)

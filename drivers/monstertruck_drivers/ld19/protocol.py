@@ -1,9 +1,9 @@
 """Packets of LDROBOT's LD06, LD19 and STL-19P ("LD19 development manual", section 3).
 
 A packet has 47 bytes, numbers with the low byte first: 0x54, 0x2C (the low five bits are the number of points, 12),
-speed (degrees a second), start angle (0.01 degrees), twelve points of distance (mm) and intensity, end angle, time
-stamp (ms, starts again at 30000), and a CRC-8 of all bytes before it. Angles grow clockwise seen from above, 0 is
-straight ahead. The points between the first and the last are evenly spaced. The unit takes no commands.
+speed (degrees per second), start angle (0.01 degrees), twelve points of distance (mm) and intensity, end angle, time
+stamp (ms, wraps at 30000), and a CRC-8 of all bytes before it. Angles grow clockwise seen from above, 0 is
+straight ahead. The points between the first and the last are evenly spaced. The unit accepts no commands.
 """
 
 import struct
@@ -21,7 +21,7 @@ HEADER: Final = b"\x54\x2c"
 STAMP_TURN: Final = 30_000
 """Period at which the time stamp wraps (ms)."""
 FULL_TURN: Final = 36_000
-"""Angles are hundredths of a degree."""
+"""Full turn, in hundredths of a degree."""
 _POLYNOMIAL: Final = 0x4D
 _PACKET: Final = struct.Struct("<2sHH36sHHB")
 POINT: Final = np.dtype([("distance", "<u2"), ("intensity", "u1")])
@@ -33,9 +33,9 @@ class ModelSheet(NamedTuple):
     title: str
     ranges: RangeSheet
     rate: int
-    """Points a second."""
+    """Measuring rate (points/s)."""
     frequency: float
-    """Turns a second where nothing drives the PWM pin."""
+    """Rotation rate while the PWM pin is not driven (Hz)."""
 
 
 MODELS: Final = {
@@ -49,15 +49,15 @@ class Ld19Packet(NamedTuple):
     """Raw numbers of one packet."""
 
     speed: int
-    """Degrees a second."""
+    """Rotation speed (degrees/s)."""
     start: int
-    """Angle of the first point, 0.01 degrees."""
+    """Angle of the first point (0.01 degrees)."""
     points: bytes
     """Twelve ``POINT``."""
     end: int
-    """Angle of the last point, 0.01 degrees."""
+    """Angle of the last point (0.01 degrees)."""
     stamp: int
-    """Milliseconds."""
+    """Time stamp (ms)."""
 
     @property
     def span(self) -> int:
@@ -65,7 +65,7 @@ class Ld19Packet(NamedTuple):
         return (self.end - self.start) % FULL_TURN
 
     def decoded(self) -> NDArray[np.void]:
-        """Points, shape (12,), of ``POINT``."""
+        """Points as an array of ``POINT``, shape (12,)."""
         return np.frombuffer(self.points, POINT)
 
 
@@ -90,7 +90,7 @@ def crc8(data: bytes) -> int:
 
 
 def build(packet: Ld19Packet) -> bytes:
-    """Bytes of a packet.
+    """Encode a packet.
 
     Raises:
         struct.error: a number beyond 16 bits.
@@ -100,14 +100,14 @@ def build(packet: Ld19Packet) -> bytes:
 
 
 class Ld19Parser:
-    """Collects bytes to packets; counts the bytes that belong to none."""
+    """Extracts packets from bytes; counts the bytes outside of packets."""
 
     def __init__(self) -> None:
         self.refused = 0
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> list[Ld19Packet]:
-        """Packets that became complete."""
+        """Return the completed packets."""
         self._buffer += data
         buffer, at, packets = self._buffer, 0, []
         while (found := buffer.find(HEADER, at)) >= 0 and len(buffer) - found >= LD19_SIZE:

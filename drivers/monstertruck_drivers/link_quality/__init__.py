@@ -1,1 +1,1 @@
-"""Quality of the truck's network link, as the kernel sees it."""
+"""Quality of the truck's network link, as reported by the kernel."""

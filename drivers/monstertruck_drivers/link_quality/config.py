@@ -15,11 +15,11 @@ class LinkQualityConfig(Schema):
 
     kind: Literal["link_quality"] = "link_quality"
     interface: Annotated[str, Field(pattern=r"^[^/\s]{1,15}$")] | None = None
-    """Name of the interface; None: the connected Wi-Fi, else the connected cable"""
+    """Name of the interface; None: the connected Wi-Fi, otherwise the connected cable"""
     rate: Annotated[float, Field(gt=0, le=10)] = 1.0
     """Checks per second"""
     smoothing: Annotated[float, Field(ge=0, le=60)] = 4.0
-    """Seconds, time constant of the signal's mean"""
+    """Time constant of the signal's mean (s)"""
     excellent: Dbm = -50.0
     """Minimum excellent signal (dBm)"""
     good: Dbm = -67.0
@@ -27,9 +27,9 @@ class LinkQualityConfig(Schema):
     fair: Dbm = -75.0
     """Minimum fair signal (dBm)."""
     poor: Dbm = -85.0
-    """Below it the link is unusable"""
+    """Minimum poor signal (dBm); below it the link is unusable"""
     hysteresis: Annotated[float, Field(ge=0, le=20)] = 3.0
-    """Margin above the limit of a better level before it is reached again (dB)"""
+    """Margin above a better level's limit before that level is reached again (dB)"""
 
     @model_validator(mode="after")
     def _limits_in_order(self) -> Self:

@@ -15,7 +15,7 @@ from monstertruck_schemas.reasons import Reason
 
 
 class LinkJudge:
-    """Judges one interface after the other."""
+    """Rates the link quality of the interface, which may change."""
 
     def __init__(self, config: LinkQualityConfig) -> None:
         self._smoothing = config.smoothing
@@ -34,7 +34,7 @@ class LinkJudge:
         self._last = 0
         self._rank: int | None = None
         self.signal: float | None = None
-        """Smoothed, dBm; None while nothing is known of it."""
+        """Smoothed signal (dBm); None if unknown."""
 
     def update(self, time_ns: int, sample: Sample | None) -> LinkLevel:
         """Process one sample; None: the interface is missing."""
@@ -79,16 +79,16 @@ FINE: Final = (Reason.OK, Severity.INFO)
 
 
 class LinkQualityDriver:
-    """Publishes the link's quality and reports when it becomes weak, is lost, and is fine again.
+    """Publishes the link's quality and reports when it becomes weak, is lost or recovers.
 
-    Heartbeats, not the signal, decide whether a station is in reach; the signal serves operators and planning.
+    Heartbeats, not the signal, decide whether a station is connected; the signal serves operators and planning.
 
     Args:
         config: interface and limits.
-        computer: computer whose interfaces.
+        computer: computer with the interfaces.
         clock: time.
         out: link health.
-        events: changes for the worse and back.
+        events: degradations and recoveries.
         name: service name.
     """
 
@@ -113,7 +113,7 @@ class LinkQualityDriver:
         self._before: tuple[int, Sample] | None = None
 
     async def run(self, ready: Ready) -> None:
-        """Sample until cancelled; no kernel output, and no missing output, ends the session."""
+        """Sample until cancelled; neither strange nor missing kernel output ends the session."""
         schedule = Schedule(self._clock, self._config.rate, Lead.IN_THREADS)
         while True:
             await schedule.next()
@@ -156,12 +156,12 @@ class LinkQualityDriver:
         self._events(*concern, self.name, f"{name}: link is {level.value}", signal=self._judge.signal)
 
     def _rates(self, stamp: int, sample: Sample | None) -> tuple[float | None, float | None]:
-        """Bytes a second received and sent since the last reading of the same interface."""
+        """Receive and transmit rate (bytes/s) since the last reading of the same interface."""
         if self._before is None or sample is None:
             return None, None
         then, before = self._before
         if before.name != sample.name or sample.received < before.received or sample.sent < before.sent:
-            return None, None  # another interface, or its counters started again
+            return None, None  # another interface, or its counters were reset
         seconds = (stamp - then) / SECOND
         return (sample.received - before.received) / seconds, (sample.sent - before.sent) / seconds
 
@@ -170,7 +170,7 @@ async def identify(computer: Computer, clock: Clock, settings: LinkQualityConfig
     """List the interfaces.
 
     Returns:
-        JSON-able: ``interfaces``, and ``chosen``: the one that is watched if none is configured.
+        JSON-able: ``interfaces``, and ``chosen``: the interface monitored if none is configured.
     """
     samples = await computer.machine.offload(lambda: read_interfaces(computer.root))
     chosen = choose(samples, None)

@@ -23,7 +23,7 @@ class NetworkEmulator(FaultyDevice):
 
     Faults (``inject``): ``signal DBM`` (from now on), ``style normal|no_dot|unsigned|header|missing`` (how
     /proc/net/wireless is printed), ``wifi on|off``, ``cable on|off``, ``remove`` (the Wi-Fi stick is unplugged),
-    ``plug``, ``reset`` (counters start again).
+    ``plug``, ``reset`` (counters restart at 0).
 
     Args:
         root: folder that stands for /.
@@ -35,7 +35,7 @@ class NetworkEmulator(FaultyDevice):
         self._files = FileTree(root)
         self._clock = clock
         self._signal: Callable[[int], float | None] = lambda _: -55.0
-        """dBm at an instant (ns); None: out of reach."""
+        """Signal at a time (ns), dBm; None: out of range."""
         self._style = "normal"
         self._present = True
         self.faults = FaultTable(
@@ -54,7 +54,7 @@ class NetworkEmulator(FaultyDevice):
         self.write()
 
     async def run(self) -> None:
-        """Follow the signal until cancelled."""
+        """Update the files with the signal until cancelled."""
         signal_period = 0.5  # seconds between two changes of the signal
         while True:
             await self._clock.sleep(signal_period)
@@ -62,7 +62,7 @@ class NetworkEmulator(FaultyDevice):
             self.write()
 
     def write(self) -> None:
-        """Bring all files up to date, each at once and whole."""
+        """Update all files, each atomically."""
         level = self._signal(self._clock.now()) if self.faults["wifi"] else None
         self._interface("lo", {"type": "772", "operstate": "unknown", "carrier": "1"})
         self._interface(
@@ -118,5 +118,5 @@ class NetworkEmulator(FaultyDevice):
 
 
 def emulated(setup: EmulatorSetup) -> NetworkEmulator:
-    """The network of a simulated truck's computer."""
+    """Create the network of a simulated truck's computer."""
     return NetworkEmulator(setup.root, setup.clock)

@@ -1,6 +1,6 @@
-"""Network interfaces in /sys/class/net and /proc/net/wireless; blocks for as long as reading small files takes.
+"""Read network interfaces from /sys/class/net and /proc/net/wireless; blocks while it reads small files.
 
-Source: kernel documentation, ABI/testing/sysfs-class-net, and the text the kernel's wireless extensions print.
+Source: kernel documentation, ABI/testing/sysfs-class-net, and the output of the kernel's wireless extensions.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ class Signal:
     level: float | None
     """Signal level (dBm); None: not connected."""
     noise: float | None
-    """dBm; None: unknown."""
+    """Noise level (dBm); None: unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,17 +31,17 @@ class Sample:
     medium: LinkMedium
     connected: bool
     signal: Signal | None
-    """None on a cable, and where the kernel has no wireless-extensions compatibility."""
+    """None for a cable, and if the kernel lacks the wireless-extensions compatibility."""
     bit_rate: float | None
-    """Bit/s."""
+    """Bit rate (bit/s)."""
     received: int
-    """Bytes since the interface came up."""
+    """Bytes received since the interface came up."""
     sent: int
     errors: int
 
 
 def parse_wireless(text: str) -> dict[str, Signal]:
-    """Rows by interface; header and damaged lines are skipped."""
+    """Parse the rows by interface; header and damaged lines are skipped."""
     rows = {}
     for line in text.splitlines():
         name, colon, rest = line.partition(":")
@@ -57,14 +57,14 @@ def parse_wireless(text: str) -> dict[str, Signal]:
 
 
 def _dbm(value: int) -> float | None:
-    """Some drivers print the byte without its sign; 0 and -256 stand for nothing."""
+    """Decode a level (dBm). Some drivers print the byte without its sign; 0 and -256 mean no value."""
     if value in (0, -256):
         return None
     return float(value - 256 if value > 63 else value)
 
 
 def read_interfaces(root: Path) -> list[Sample]:
-    """All Wi-Fi and wired interfaces, bridges and the like left out.
+    """Read all Wi-Fi and wired interfaces, without bridges and other virtual ones.
 
     Args:
         root: folder that holds ``proc`` and ``sys``.
@@ -77,7 +77,7 @@ def read_interfaces(root: Path) -> list[Sample]:
 def choose(samples: list[Sample], name: str | None) -> Sample | None:
     """Return the named interface; without a name, the interface that the truck most likely uses.
 
-    Connected interfaces come before unconnected ones, then Wi-Fi before cable, because only Wi-Fi gets weak.
+    Connected interfaces come before unconnected ones, then Wi-Fi before cable, because only Wi-Fi can become weak.
     """
     if name is not None:
         return next((sample for sample in samples if sample.name == name), None)

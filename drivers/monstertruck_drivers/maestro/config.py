@@ -24,7 +24,7 @@ class ServoConfig(ServoPulses):
     """Acceleration limit of the pulse (0.25 us per 10 ms per 80 ms); 0 = unlimited."""
 
     def quarters(self, angle: float) -> int:
-        """Target in quarter microseconds for a servo angle (rad, left positive), held within all limits."""
+        """Target (quarter microseconds) for a servo angle (rad, left positive), clamped to all limits."""
         return round(4 * self.pulse_us(angle))
 
     def within_limits(self, quarters: int) -> bool:
@@ -38,7 +38,7 @@ class ServoConfig(ServoPulses):
 
 
 class CurrentInputConfig(Schema):
-    """Current into the pack by a Hall sensor on an analog input; the default is an ACS712 of 20 A."""
+    """Sensor of the current into the pack: a Hall sensor on an analog input; the default is an ACS712 of 20 A."""
 
     channel: Channel = 4
     """Analog input of the servo controller."""
@@ -50,7 +50,7 @@ class CurrentInputConfig(Schema):
     """Whether the voltage falls while the pack is charged"""
 
     def amps(self, raw: int) -> float:
-        """Current into the pack (A) of a 10-bit reading against the 5 V rail."""
+        """Current into the pack (A) for a 10-bit reading relative to the 5 V rail."""
         amps = (raw * 5.0 / ADC_MAX - self.zero) / self.volts_per_amp
         return -amps if self.reverse else amps
 
@@ -61,11 +61,13 @@ class BatteryInputConfig(PackConfig):
     channel: Channel = 5
     """Analog input of the servo controller."""
     volts_per_count: Annotated[float, Field(gt=0)] = 5.0 * 10 / ADC_MAX
-    """The reference is the USB 5 V rail (5 % tolerance) behind a 1:10 divider: calibrate with a multimeter."""
+    """Scale (V per count). The reference is the USB 5 V rail (5 % tolerance) behind a 1:10 divider: calibrate with a
+    multimeter.
+    """
     gain: Annotated[float, Field(gt=0)] = 1.0
     """Calibrated factor on the voltage."""
     offset: float = 0.0
-    """Volts added after the gain."""
+    """Offset added after the gain (V)."""
     current: CurrentInputConfig | None = None
     """Sensor of the current into the pack, which shows charging; null: none"""
 
@@ -78,7 +80,7 @@ class BatteryInputConfig(PackConfig):
         return self
 
     def volts(self, raw: int) -> float:
-        """Pack voltage of a 10-bit reading."""
+        """Pack voltage (V) for a 10-bit reading."""
         return raw * self.volts_per_count * self.gain + self.offset
 
 
@@ -98,9 +100,9 @@ class MaestroConfig(Schema):
     """Time constant of the wheels' movement after the dead time (s); null if it was not measured"""
     battery: BatteryInputConfig | None = BatteryInputConfig()
     poll_rate: Annotated[float, Field(gt=0, le=50)] = 20.0
-    """Times a second both pulses and the error word are read."""
+    """Rate at which both pulses and the error word are read (Hz)."""
     battery_rate: Annotated[float, Field(gt=0, le=50)] = 10.0
-    """Times a second the battery is read; never more often than ``poll_rate``."""
+    """Rate at which the battery is read (Hz); never more often than ``poll_rate``."""
     answer_timeout: Annotated[float, Field(gt=0, le=1)] = 0.1
     """Timeout of all answers to one poll (s)."""
     command_timeout: Annotated[float, Field(gt=0, le=2)] = 0.25
@@ -108,15 +110,15 @@ class MaestroConfig(Schema):
     deadman_channel: Channel | None = None
     """Digital output held high while commands are fresh; wire it to the motor controller's quick-stop input."""
     deadman_feed: Literal["fresh", "always"] = "fresh"
-    """When the Maestro's own serial time-out is fed: see ``MaestroDriver``."""
+    """When the driver feeds the Maestro's serial timeout: see ``MaestroDriver``."""
     device_number: Annotated[int, Field(ge=0, le=127)] | None = None
     """Device number of the Pololu protocol; null selects the compact protocol."""
     use_crc: bool = False
-    """Must equal the unit's own setting."""
+    """Whether commands carry a CRC; must match the unit's own setting."""
 
     @property
     def servos(self) -> tuple[ServoConfig, ...]:
-        """Front and rear, or front left, front right, rear left and rear right."""
+        """Front and rear servo, or front left, front right, rear left and rear right."""
         if self.front_right is None or self.rear_right is None:
             return self.front, self.rear
         return self.front, self.front_right, self.rear, self.rear_right

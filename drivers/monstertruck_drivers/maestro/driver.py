@@ -21,15 +21,14 @@ from monstertruck_schemas.sensor import Battery, DriveFeedback, SteeringFeedback
 class MaestroDriver:
     """Sends every steering command at once, and polls pulses, errors and battery in between.
 
-    **Deadman.** The Maestro's serial time-out (set once in the unit, about 0.5 s) sends its channels home when
-    no valid command of any kind comes: polling feeds it as well as targets do. Commands are stale
-    ``command_timeout`` after their stamp. Then the servos hold, the deadman line (if configured) is released by
-    an explicit target, and with ``deadman_feed: fresh`` the driver sends nothing until the next command, so that
-    the time-out trips too although the driver still lives; feedback and battery pause meanwhile. With ``always``
-    polling continues, and the time-out guards only against a hung or dead process. Before the first command of a
-    session there is nothing to guard: the line is low and polling runs. Channels that go home are a setting
-    of the unit: deadman line "Off", steering "Ignore". A command may lower the line too: nothing else reaches a motor
-    whose link is lost.
+    **Deadman.** The Maestro's serial timeout (set once in the unit, about 0.5 s) sends its channels home when no valid
+    command arrives; polling resets it as targets do. A command is stale ``command_timeout`` after its stamp. Then the
+    servos hold, and an explicit target releases the deadman line, if configured. With ``deadman_feed: fresh`` the
+    driver then sends nothing until the next command, so that the timeout trips as well although the driver still runs;
+    feedback and battery pause meanwhile. With ``always`` polling continues, and the timeout protects only against a
+    hung or dead process. Before the first command of a session the line is low and polling runs. The unit's settings
+    define where channels go: deadman line "Off", steering "Ignore". A command can also lower the line: nothing else
+    reaches a motor whose link is lost.
 
     Args:
         config: calibration and rates.
@@ -37,7 +36,7 @@ class MaestroDriver:
         clock: time, also the clock of the commands' stamps.
         commands: steering commands of the gate.
         out: feedback, angles as servo angles in rad, left positive.
-        battery: pack voltage; None when the battery is measured elsewhere.
+        battery: pack voltage; None if another device measures the battery.
         events: errors of the device.
         name: service name.
         drive: motor feedback, whose current explains the battery's sag.
@@ -72,7 +71,7 @@ class MaestroDriver:
         self._command: SteeringCommand | None = None
         """Latest command."""
         self._fresh: SteeringCommand | None = None
-        """The same, until it is stale."""
+        """Latest command until it is stale."""
         self._failing = False
         self._misses = Misses()
 
@@ -82,7 +81,7 @@ class MaestroDriver:
         Raises:
             DeviceLostError: unplugged.
             DeviceTimeoutError: no answers (three polls in a row); at the start: wrong mode or wrong port.
-            ProtocolError: answers out of form, three polls in a row.
+            ProtocolError: malformed answers, three polls in a row.
             WrongDeviceError: another device answers on this port.
             PortBusyError: another process holds the port.
         """
@@ -91,7 +90,7 @@ class MaestroDriver:
         async with await self._port.open() as link:
             encoder = Encoder(config.device_number, config.use_crc)
             session = MaestroSession(link, self._clock, encoder, config.answer_timeout)
-            # Errors pending since power-up say nothing about this session.
+            # Errors pending since power-up are unrelated to this session.
             await session.identify(*(servo.channel for servo in config.servos))
             self._restore(session)
             ready()
@@ -114,7 +113,7 @@ class MaestroDriver:
             cycle += 1
 
     async def _follow(self, session: MaestroSession, until: int) -> None:
-        """Pass commands on as they come."""
+        """Forward commands as they arrive."""
 
         def pass_on(command: SteeringCommand) -> bool:
             if self._is_fresh(command):
@@ -130,7 +129,7 @@ class MaestroDriver:
         return self._clock.now() - command.stamp <= self._config.command_timeout * SECOND
 
     def _watch(self, session: MaestroSession) -> None:
-        """Release the deadman when commands stop."""
+        """Release the deadman line when no commands arrive."""
         if self._fresh is not None and not self._is_fresh(self._fresh):
             self._fresh = None
             session.send(*self._line(session, high=False), *self._more(session, rest=True))
@@ -148,15 +147,15 @@ class MaestroDriver:
         return [] if channel is None else [session.encode.set_target(channel, line_high if high else 4000)]
 
     def _more(self, session: MaestroSession, *, rest: bool = False) -> list[bytes]:
-        """Commands to what else hangs on the unit; ``rest`` brings it to rest."""
+        """Commands to other devices on the unit; ``rest`` stops them."""
         del session, rest
         return []
 
     def _polled(self, stamp: int, received: int) -> None:
-        """Publish what else is known after a poll."""
+        """Publish the feedback of other devices after a poll."""
 
     def _restore(self, session: MaestroSession) -> None:
-        """Send everything a Maestro forgets at power-up or loses by an error."""
+        """Send all settings that a Maestro loses at power-up or by an error."""
         packets: list[bytes] = []
         for servo in self._config.servos:
             packets.append(session.encode.set_speed(servo.channel, servo.speed))
@@ -191,7 +190,7 @@ class MaestroDriver:
         strange = False
         for i, (servo, position) in enumerate(zip(self._config.servos, positions, strict=True)):
             if position == 0:
-                continue  # no pulses, the servo stays where it is
+                continue  # no pulses: the servo stays in place
             if servo.within_limits(position):
                 self._angles[i] = servo.angle(position)
             else:
@@ -220,7 +219,7 @@ class MaestroDriver:
 
 
 class BatteryInput:
-    """The analog input the battery hangs on."""
+    """Analog input that measures the battery."""
 
     def __init__(self, config: BatteryInputConfig, monitor: BatteryMonitor) -> None:
         self.channels = [config.channel] if config.current is None else [config.channel, config.current.channel]
@@ -228,7 +227,7 @@ class BatteryInput:
         self._monitor = monitor
 
     def take(self, stamp: int, received: int, raw: int, current: int | None = None) -> None:
-        """Take one 10-bit reading, and one of the current where it is measured."""
+        """Process one 10-bit reading, and one of the current if it is measured."""
         sensor = self._config.current
         amps = None if sensor is None or current is None else sensor.amps(current)
         self._monitor.take(stamp, received, self._config.volts(raw), at_limit=raw in (0, ADC_MAX), current=amps)

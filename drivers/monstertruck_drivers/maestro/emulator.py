@@ -1,4 +1,4 @@
-"""The device side of a Micro Maestro, byte for byte."""
+"""Device side of a Micro Maestro, byte for byte."""
 
 import asyncio
 import math
@@ -24,7 +24,7 @@ from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
 
 TICK: Final = 10_000_000
-"""Nanoseconds between two steps of a ramp."""
+"""Step of a ramp (ns)."""
 AT_JUNK: Final = b"AT\r\nAT+CGMI\r\nATI\r\n"
 """Bytes that a modem manager sends to an unknown serial port."""
 
@@ -35,7 +35,7 @@ CHANNEL_ORDERS: Final = {
 }
 GO_HOME: Final = "go_home"
 CHANNEL_COMMANDS: Final = (Code.SET_TARGET, Code.SET_SPEED, Code.SET_ACCELERATION, Code.GET_POSITION)
-"""Commands that name a channel first."""
+"""Commands whose first data byte is a channel."""
 
 Mode = Literal["dual_port", "uart"]
 Home = float | Literal["off", "ignore"]
@@ -44,7 +44,7 @@ Home = float | Literal["off", "ignore"]
 
 @dataclass(slots=True)
 class Ramp:
-    """Pulse of one channel on its way to its target; all in quarter microseconds, velocity per 10 ms."""
+    """Pulse of one channel on its ramp to the target; all in quarter microseconds, velocity per 10 ms."""
 
     target: int = 0
     position: float = 0.0
@@ -53,13 +53,13 @@ class Ramp:
     acceleration: int = 0
 
     def aim(self, target: int) -> None:
-        """Change the target. Without limits, and from or to 0 (no pulses), there is nothing to ramp."""
+        """Change the target. Without limits, and from or to 0 (no pulses), it is reached at once."""
         if target == 0 or self.target == 0 or not (self.speed or self.acceleration):
             self.position, self.velocity = float(target), 0.0
         self.target = target
 
     def step(self) -> None:
-        """10 ms pass."""
+        """Advance the ramp by 10 ms."""
         left = self.target - self.position
         top = self.speed or math.inf
         if not self.acceleration:
@@ -78,14 +78,14 @@ class Ramp:
 class MaestroEmulator(FaultyDevice):
     """A Micro Maestro 6 powered by USB.
 
-    Settings given here live in the unit's non-volatile memory; targets, speeds and accelerations do not.
+    The arguments are settings in the unit's non-volatile memory; targets, speeds and accelerations are volatile.
     Faults (``inject``): ``brown_out [seconds]``, ``at_junk``, ``mode dual_port|uart``, ``mute on|off`` (no
-    answers), ``late SECONDS [COUNT]`` (answers come later), ``pulse CHANNEL MICROSECONDS`` (moved by another
-    program, beyond its limits), ``error BIT``, ``rail VOLTS``, ``noise LSB``, ``battery VOLTS``.
+    answers), ``late SECONDS [COUNT]`` (late answers), ``pulse CHANNEL MICROSECONDS`` (another program moves it beyond
+    its limits), ``error BIT``, ``rail VOLTS``, ``noise LSB``, ``battery VOLTS``.
 
     Args:
         clock: time.
-        servos: physics; without it the analog inputs read ``analog_v`` and the pulses move nothing.
+        servos: physics; if None, the analog inputs read ``analog_v`` and the pulses move nothing.
         seed: seed of the analog noise.
         mode: serial mode; in ``uart`` (as from the factory) bytes over USB are ignored.
         crc: whether commands must carry a CRC-7 byte.
@@ -97,7 +97,7 @@ class MaestroEmulator(FaultyDevice):
         limits_us: minimum and maximum pulse (us); targets are clamped.
         noise_lsb: standard deviation of the analog noise.
         rail_drift_v: amplitude of a slow (60 s) swing of the 5 V rail, the reference of the inputs.
-        usb: port of the unit; lets a brown-out make it vanish and come back.
+        usb: port of the unit; a brown-out unplugs and replugs it.
         on_output: called with (channel, high) when a digital output changes, whatever the cause.
     """
 
@@ -126,7 +126,7 @@ class MaestroEmulator(FaultyDevice):
         self.received = ReceivedBytes()
         """Bytes the host sent to the Command Port, for tests."""
         self.analog_v = dict.fromkeys(range(CHANNELS), 2.4)
-        """Volts at the inputs while there is no plant."""
+        """Voltages of the inputs without ``servos``."""
         self.rail_v = 5.0
         self._clock = clock
         self._servos = servos
@@ -201,7 +201,7 @@ class MaestroEmulator(FaultyDevice):
         return channel in self._outputs and self._ramps[channel].target >= OUTPUT_THRESHOLD
 
     def power_cycle(self) -> None:
-        """Supply off and on: targets, speeds, errors are lost, settings stay."""
+        """Switch the supply off and on: targets, speeds and errors are lost, settings stay."""
         self._advance()
         self._boot()
         self._fed_again.set()
@@ -215,7 +215,7 @@ class MaestroEmulator(FaultyDevice):
                 self._take(end, await end.read())
 
     def _receive_junk(self) -> None:
-        self._execute(AT_JUNK)  # it answers nothing to it
+        self._execute(AT_JUNK)  # the unit sends no answer to these bytes
 
     def _set_mode(self, mode: str) -> None:
         modes: dict[str, Mode] = {"dual_port": "dual_port", "uart": "uart"}
@@ -280,7 +280,7 @@ class MaestroEmulator(FaultyDevice):
             case Code.GET_SCRIPT_STATUS:
                 answer = b"\x01"  # no script is stored
             case _:
-                pass  # script commands: nothing to run
+                pass  # script commands: no script to run
         return answer
 
     def _order_home(self, asked: int) -> None:
@@ -343,7 +343,7 @@ class MaestroEmulator(FaultyDevice):
     # Time
 
     def _advance(self) -> None:
-        """Let the servos follow the old targets up to now, then the ramps."""
+        """Let the servos follow the old targets until now, then advance the ramps."""
         now = self._clock.now()
         if self._servos is not None:
             self._servos.advance(now)
@@ -361,7 +361,7 @@ class MaestroEmulator(FaultyDevice):
                 ramp.step()
 
     async def _watch(self) -> None:
-        """The serial time-out: fires when nothing valid came, although nothing is sent."""
+        """Serial timeout: it trips when no valid command arrives, even while the host is silent."""
         while self._timeout:
             self._fed_again.clear()
             if self._timed_out:
@@ -374,12 +374,12 @@ class MaestroEmulator(FaultyDevice):
     # Supply
 
     def _plugged(self, plugged: bool) -> None:
-        """USB is the logic's supply."""
+        """Power the logic from USB."""
         self._powered = plugged
         self.power_cycle()
 
     def _brown_out(self, seconds: str = "0.5") -> None:
-        """A stalled servo pulled the rail down: gone from USB, back with nothing in mind."""
+        """Simulate a brown-out by a stalled servo: the unit leaves USB and returns without its volatile state."""
         if self.usb is None:
             self.power_cycle()
         else:
@@ -388,6 +388,6 @@ class MaestroEmulator(FaultyDevice):
 
 
 def emulated(setup: EmulatorSetup) -> MaestroEmulator:
-    """The servo controller of a simulated truck."""
+    """Create the servo controller of a simulated truck."""
     servos = setup.physics.servos
     return MaestroEmulator(setup.clock, servos, seed=setup.seed, inputs=servos.inputs)

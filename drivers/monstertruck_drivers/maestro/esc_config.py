@@ -1,4 +1,4 @@
-"""Settings of a radio-control speed controller (ESC) on a channel of a Maestro, which steers as well."""
+"""Settings of a radio-control speed controller (ESC) on a channel of a Maestro that also steers."""
 
 from typing import Literal, Self
 
@@ -17,7 +17,7 @@ class EscConfig(EscPulses):
     """Channel of the servo controller."""
 
     def quarters(self, rate: float) -> int:
-        """Target in quarter microseconds for a rate, rad/s, forward positive, held within the limits."""
+        """Target (quarter microseconds) for a rate (rad/s), forward positive, clamped to the limits."""
         return round(4 * self.pulse_us(rate))
 
 
@@ -41,7 +41,7 @@ class MaestroEscConfig(Schema):
 
     @property
     def battery(self) -> BatteryInputConfig | None:
-        """Its battery input."""
+        """Battery input of the unit."""
         return self.unit.battery
 
     @property

@@ -1,8 +1,9 @@
-"""Driver of a Maestro with a speed controller (ESC) on one of its channels: drives, steers, measures the battery.
+"""Driver of a Maestro with a speed controller (ESC) on one of its channels: drives, steers, and measures the battery.
 
-The pulse follows every command that the gate sends to the servos, so a stop waits for the next tick. Stale commands
-make it neutral, as do start and end of a session. The unit's serial time-out is the watchdog: it must send this
-channel to the neutral pulse. The motor is not measured: the reported rate is the commanded rate, slowed as configured.
+The pulse follows every command that the gate sends to the servos, so a stop waits for the next tick. The pulse becomes
+neutral when commands are stale and at the start and end of a session. The unit's serial timeout is the watchdog: it
+must send this channel to the neutral pulse. The motor is not measured: the reported rate is the commanded rate, delayed
+as configured.
 """
 
 from monstertruck_drivers.esc import UnmeasuredMotor
@@ -35,8 +36,8 @@ class MaestroEscDriver(MaestroDriver):
         out_3: not used.
         out_4: not used.
         steering: pulses being sent, as servo angles.
-        battery: pack voltage; None when the battery is measured elsewhere.
-        events: where errors of the device are reported.
+        battery: pack voltage; None if another device measures the battery.
+        events: errors of the device.
         name: name of the service.
     """
 
@@ -68,7 +69,7 @@ class MaestroEscDriver(MaestroDriver):
         self._motor = UnmeasuredMotor(config.esc, clock, commands, out, config.command_timeout)
 
     async def run(self, ready: Ready) -> None:
-        """Serve one session; raises as ``MaestroDriver.run``."""
+        """Serve one session; raises the errors of ``MaestroDriver.run``."""
         self._motor.begin()
         await super().run(ready)
 

@@ -46,7 +46,7 @@ class MaestroEscEmulator(MaestroEmulator):
         )
 
     async def run(self, end: DeviceEnd) -> None:
-        """Serve the Command Port, and let the speed controller read its pulses."""
+        """Serve the Command Port, and run the speed controller on its pulses."""
         async with asyncio.TaskGroup() as group:
             group.create_task(self._esc.run())
             await super().run(end)
@@ -56,7 +56,7 @@ class MaestroEscEmulator(MaestroEmulator):
 
 
 def emulated(setup: EmulatorSetup) -> MaestroEscEmulator:
-    """The servo and speed controller of a simulated robot."""
+    """Create the servo and speed controller of a simulated robot."""
     return MaestroEscEmulator(
         setup.clock, setup.physics.motors[0], setup.physics.servos, setup.settings, seed=setup.seed
     )

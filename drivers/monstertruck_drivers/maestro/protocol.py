@@ -10,11 +10,11 @@ from typing import Final, NamedTuple
 POLOLU_START: Final = 0xAA
 MINI_SSC_START: Final = 0xFF
 CHANNELS: Final = 6
-"""Channels of the Micro Maestro."""
+"""Number of channels of the Micro Maestro."""
 POSITION_MAX: Final = 0x3FFF
 """Maximum position or target of the 14-bit format (quarter microseconds)."""
 OUTPUT_THRESHOLD: Final = 6000
-"""Targets from here on switch a digital output high."""
+"""Minimum target that switches a digital output high."""
 ADC_MAX: Final = 1023
 ERROR_MASK: Final = 0x01FF
 
@@ -48,7 +48,7 @@ class Code(IntEnum):
     RESTART_SCRIPT_PARAMETER = 0xA8
     GET_SCRIPT_STATUS = 0xAE
     MINI_SSC = MINI_SSC_START
-    """Not a command byte: stands for a Mini-SSC packet, data (channel, value)."""
+    """Not a command byte: represents a Mini-SSC packet with data (channel, value)."""
 
 
 DATA_BYTES: Final[dict[int, int]] = {
@@ -64,7 +64,7 @@ DATA_BYTES: Final[dict[int, int]] = {
     Code.RESTART_SCRIPT_PARAMETER: 3,
     Code.GET_SCRIPT_STATUS: 0,
 }
-"""Data bytes after each command the Micro knows."""
+"""Number of data bytes after each command of the Micro."""
 
 
 def error_names(word: int) -> list[str]:
@@ -113,13 +113,13 @@ class Encoder:
     crc: bool = False
 
     def command(self, code: int, *data: int) -> bytes:
-        """One command of any kind."""
+        """Encode a command of any kind."""
         head = bytes((code,)) if self.device is None else bytes((POLOLU_START, self.device, code & 0x7F))
         packet = head + bytes(data)
         return packet + bytes((crc7(packet),)) if self.crc else packet
 
     def set_target(self, channel: int, quarters: int) -> bytes:
-        """Target in quarter microseconds; 0 switches the pulses off."""
+        """Encode a target (quarter microseconds); 0 switches the pulses off."""
         return self.command(Code.SET_TARGET, channel, *halves(quarters))
 
     def set_speed(self, channel: int, speed: int) -> bytes:
@@ -127,37 +127,37 @@ class Encoder:
         return self.command(Code.SET_SPEED, channel, *halves(speed))
 
     def set_acceleration(self, channel: int, acceleration: int) -> bytes:
-        """Acceleration in 0.25 us per 10 ms per 80 ms, 0..255; 0 = unlimited."""
+        """Encode an acceleration limit (0.25 us per 10 ms per 80 ms), 0..255; 0 = unlimited."""
         return self.command(Code.SET_ACCELERATION, channel, *halves(acceleration))
 
     def get_position(self, channel: int) -> bytes:
-        """Ask for the pulse being sent (quarter microseconds) or the input's 10-bit value; answer: two bytes."""
+        """Request the pulse being sent (quarter microseconds) or the input's 10-bit value; the answer has two bytes."""
         return self.command(Code.GET_POSITION, channel)
 
     def get_errors(self) -> bytes:
-        """Ask for the error word and clear it; answer: two bytes."""
+        """Request the error word, which clears it; the answer has two bytes."""
         return self.command(Code.GET_ERRORS)
 
 
 class ServoCommand(NamedTuple):
-    """One complete, correct command as the device sees it."""
+    """One complete, valid command as received by the device."""
 
     code: Code
     data: tuple[int, ...] = ()
 
     @property
     def value(self) -> int:
-        """14-bit value behind the channel byte."""
+        """14-bit value after the channel byte."""
         return self.data[1] | self.data[2] << 7
 
 
 @dataclass(slots=True)
 class Decoder:
-    """Device side: bytes in, commands and errors out, however they are cut.
+    """Device side: parses bytes, in chunks of any size, into commands and errors.
 
     Args:
         device: own device number; Pololu packets for others are skipped.
-        crc: expect a CRC-7 byte behind every command.
+        crc: expect a CRC-7 byte after every command.
     """
 
     device: int = 12
@@ -166,7 +166,7 @@ class Decoder:
     _skipping: bool = False
 
     def feed(self, data: bytes) -> list[ServoCommand | Error]:
-        """Everything that became complete, in order."""
+        """Return the completed commands and errors, in order."""
         out: list[ServoCommand | Error] = []
         for byte in data:
             if byte >= 0x80 and not self._is_mini_ssc_value(byte):
@@ -213,7 +213,7 @@ class Decoder:
         return whole
 
     def _skip(self, result: Error | None) -> Error | None:
-        """Drop the packet and the data bytes that still belong to it."""
+        """Drop the packet and its remaining data bytes."""
         self._packet.clear()
         self._skipping = True
         return result

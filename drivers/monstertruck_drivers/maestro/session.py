@@ -1,4 +1,4 @@
-"""Requests and replies, with a Maestro over one open link; shared by the driver and `identify`."""
+"""Requests and replies of a Maestro over one open link; shared by the driver and `identify`."""
 
 from monstertruck_drivers.link import Link
 from monstertruck_drivers.maestro.config import MaestroConfig
@@ -24,10 +24,10 @@ class MaestroSession:
         self._clock = clock
         self._timeout = timeout
         self._in_step = True
-        """No answer to an earlier question can come any more."""
+        """Whether no answer to an earlier request is outstanding."""
 
     def send(self, *commands: bytes) -> None:
-        """Commands without an answer.
+        """Send commands that have no answer.
 
         Raises:
             DeviceLostError: unplugged.
@@ -35,11 +35,11 @@ class MaestroSession:
         self._link.write(b"".join(commands))
 
     async def ask(self, *requests: bytes) -> list[int]:
-        """Send requests in one go and collect a 16-bit word for each.
+        """Send requests together and collect a 16-bit word for each.
 
         Raises:
             DeviceLostError: unplugged.
-            DeviceTimeoutError: not all answers came in time.
+            DeviceTimeoutError: answers are missing.
         """
         if not self._in_step or self._link.discard():
             await self._resynchronise()
@@ -54,13 +54,13 @@ class MaestroSession:
         return DeviceTimeoutError(f"{self._link.name}: no answer within {self._timeout} s")
 
     async def _resynchronise(self) -> None:
-        """Wait out a late answer: silence, and then exactly the answer to a question of known length.
+        """Discard late answers: wait for silence, then for exactly the answer to a request of known length.
 
         Raises:
-            DeviceTimeoutError: it does not come, or more than it does.
+            DeviceTimeoutError: that answer is missing, or more arrives than that.
         """
         self._in_step = False
-        # Tries to come into step with the answers again, at one time.
+        # Attempts to resynchronise with the answers.
         for _ in range(4):
             if await self._speaks():
                 continue
@@ -83,10 +83,10 @@ class MaestroSession:
         Raises:
             DeviceLostError: unplugged.
             DeviceTimeoutError: silence.
-            WrongDeviceError: bytes came that no Maestro sends.
+            WrongDeviceError: bytes arrived that a Maestro does not send.
         """
         heard = False
-        # Tries to identify: another program may be talking into a freshly plugged port.
+        # Attempts to identify: another program may be writing to a newly plugged port.
         for _ in range(3):
             heard |= await self._speaks()
             try:
@@ -112,7 +112,7 @@ class MaestroSession:
         )
 
     async def _speaks(self) -> bool:
-        """Whether unrequested bytes come; they are dropped."""
+        """Whether unrequested bytes arrive; they are dropped."""
         try:
             # Silence that ends an answer (s); a Maestro sends nothing without a request.
             async with self._clock.deadline(0.02):
@@ -121,7 +121,7 @@ class MaestroSession:
             return False
 
     def check(self, positions: list[int], errors: int) -> None:
-        """Refuse words that cannot be the requested values.
+        """Reject words that cannot be the requested values.
 
         Raises:
             ProtocolError: malformed, as after a lost byte.
@@ -130,7 +130,7 @@ class MaestroSession:
             raise ProtocolError(f"{self._link.name}: malformed answers: errors {errors:#x}, positions {positions}")
 
     def require_link(self) -> None:
-        """Notice an unplugged device without sending anything.
+        """Detect an unplugged device without sending anything.
 
         Raises:
             DeviceLostError: the link is down.
@@ -140,7 +140,7 @@ class MaestroSession:
 
 
 async def identify(link: Link, clock: Clock, settings: MaestroConfig | MaestroEscConfig) -> dict[str, object]:
-    """Read the error word and all channels by compact commands without CRC; reading clears the errors.
+    """Read the error word, which clears it, and all channels, with compact commands without CRC.
 
     Returns:
         JSON-able: ``errors`` that were pending, ``channels``: for each channel the pulse in microseconds if it is a

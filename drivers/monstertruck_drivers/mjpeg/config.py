@@ -16,23 +16,23 @@ class MjpegConfig(Schema):
     """Path on the HTTP server at the port, such as /stream: multipart or single pictures; null: the port sends
     pictures without HTTP"""
     poll: Annotated[float, Field(gt=0, le=30)] | None = None
-    """Pictures to fetch a second, where ``http`` gives a single one; null: it streams"""
+    """Polling rate if ``http`` returns a single picture (Hz); null: it streams"""
     width: Annotated[int, Field(ge=16, le=4096)] = 640
-    """Width that the camera is set to (pixels); others are reported"""
+    """Configured width of the camera (pixels); other sizes are reported"""
     height: Annotated[int, Field(ge=16, le=4096)] = 480
-    """Height that the camera is set to (pixels)"""
+    """Configured height of the camera (pixels)"""
     rate: Annotated[float, Field(gt=0, le=120)] = 15.0
-    """Pictures a second that the camera is set to"""
+    """Configured rate of the camera (pictures/s)"""
     delay: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Time from exposure to arrival (s): the images contain no time stamps"""
     most: Annotated[int, Field(ge=10_000, le=10_000_000)] = 2_000_000
     """Maximum length of a picture (bytes)"""
     watchdog: Annotated[float, Field(gt=0, le=60)] = 5.0
-    """Seconds without a whole picture that end the session; a program needs some of them to start its camera"""
+    """Time without a complete picture after which the session ends (s); it includes a program's start of its camera"""
     frame: FrameId = "camera"
     """Frame of the pictures"""
     lens: LensConfig = LensConfig()
-    """Lens, for measurements by its pictures"""
+    """Lens, for measurements in its pictures"""
 
     @model_validator(mode="after")
     def _polls_by_http(self) -> Self:
@@ -42,5 +42,5 @@ class MjpegConfig(Schema):
 
     @property
     def buffers(self) -> int:
-        """Pictures kept: the latest."""
+        """Number of pictures kept: the latest."""
         return 1

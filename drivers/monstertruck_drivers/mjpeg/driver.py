@@ -10,14 +10,14 @@ from monstertruck_schemas.sensor import CompressedImage
 
 
 class MjpegDriver(WebcamDriver):
-    """Publishes every whole picture, stamped with its arrival minus the configured delay.
+    """Publishes every complete picture, stamped with its arrival minus the configured delay.
 
     Args:
         config: settings of the camera.
         port: program, TCP port or emulated camera.
         clock: time.
         out: pictures.
-        events: sizes that differ, pictures refused.
+        events: deviating sizes, rejected pictures.
         name: service name.
     """
 
@@ -36,10 +36,10 @@ class MjpegDriver(WebcamDriver):
         """Serve one session; it is ready with its first whole picture.
 
         Raises:
-            DeviceLostError: the program cannot be started or ended; no server, or it hung up.
-            DeviceTimeoutError: no picture within the watchdog's time.
+            DeviceLostError: the program cannot be started, or it ended; no server, or it closed the connection.
+            DeviceTimeoutError: no picture within ``watchdog``.
             DeviceMismatchError: the server refuses the path.
-            WrongDeviceError: the server gives something else than pictures.
-            ProtocolError: no HTTP, or pictures but no whole one within that time.
+            WrongDeviceError: the server sends other content than pictures.
+            ProtocolError: no HTTP, or no complete picture within that time.
         """
         await super().run(ready)

@@ -1,4 +1,4 @@
-"""Emulated camera that sends motion JPEG: plain, as a multipart answer, or picture by picture."""
+"""Emulated camera that sends motion JPEG: plain, as a multipart answer, or one picture per request."""
 
 import asyncio
 from typing import Final
@@ -17,15 +17,15 @@ from monstertruck_runtime.threads import Offload, in_thread
 
 BOUNDARY: Final = b"picture"
 CHUNK: Final = 4095
-"""Bytes written at a time: as many as the reader of a pty gets in one go."""
+"""Bytes written at a time: the maximum that the reader of a pty receives at once."""
 
 
 class MjpegEmulator(FaultyDevice):
     """Camera of a program or of a server; a server serves its latest client.
 
     Faults (``inject``): ``corrupt N`` (a header is overwritten), ``truncate N`` (the second half is missing),
-    ``oversize N`` (zeros without an end), ``stuck on|off`` (sends nothing), ``status CODE|off`` (the server refuses),
-    ``text on|off`` (it gives a page), ``chunked on|off``.
+    ``oversize N`` (endless zeros), ``stuck on|off`` (sends nothing), ``status CODE|off`` (the server refuses),
+    ``text on|off`` (it returns a page), ``chunked on|off``.
 
     Args:
         clock: time.
@@ -55,7 +55,7 @@ class MjpegEmulator(FaultyDevice):
         self._number = 0
 
     def power_cycle(self) -> None:
-        """It counts from 0."""
+        """Restart the picture count at 0."""
         self._number = 0
 
     async def run(self, end: DeviceEnd) -> None:
@@ -133,5 +133,5 @@ class MjpegEmulator(FaultyDevice):
 
 
 def emulated(setup: EmulatorSetup) -> MjpegEmulator:
-    """The camera of a simulated robot."""
+    """Create the camera of a simulated robot."""
     return MjpegEmulator(setup.clock, setup.physics.view, setup.settings, offload=setup.offload)

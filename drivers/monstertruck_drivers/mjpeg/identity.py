@@ -1,4 +1,4 @@
-"""Wait for a picture of a camera on a port."""
+"""Take a picture from a camera on a port."""
 
 from monstertruck_drivers.link import Link
 from monstertruck_drivers.mjpeg.config import MjpegConfig
@@ -8,7 +8,7 @@ from monstertruck_runtime.clock import Clock
 
 
 class _OpenPort:
-    """Port whose link is open already."""
+    """Port whose link is already open."""
 
     def __init__(self, link: Link) -> None:
         self.name = link.name
@@ -25,7 +25,7 @@ async def identify(link: Link, clock: Clock, settings: MjpegConfig) -> dict[str,
         JSON-able: ``width`` and ``height`` (pixels), ``bytes``.
 
     Raises:
-        DeviceError: as the driver's ``run``.
+        DeviceError: see the driver's ``run``.
     """
     source = LinkSource(settings, _OpenPort(link), clock)
     async with await source.open(Mode(settings.width, settings.height, settings.rate), settings.buffers) as stream:

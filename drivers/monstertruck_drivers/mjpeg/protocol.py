@@ -1,4 +1,4 @@
-"""Pictures in a stream of bytes, and the answer of an HTTP server that sends them.
+"""Parsers of pictures in a byte stream, and of the answer of an HTTP server that sends them.
 
 Sources: ITU-T T.81, annex B (markers); RFC 9112 (message format, chunked coding); RFC 2046, 5.1 (multipart, whose
 headers are skipped as bytes between pictures).
@@ -19,7 +19,7 @@ HEAD_MOST: Final = 8192
 
 @dataclass(slots=True)
 class PictureSplitter:
-    """Incremental parser: whole pictures, and what was cut off, for the caller to refuse.
+    """Incremental parser of pictures; it also returns truncated ones, for the caller to reject.
 
     Args:
         most: maximum length of a picture (bytes).
@@ -29,7 +29,7 @@ class PictureSplitter:
     _buffer: bytearray = field(default_factory=bytearray)
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Return the pictures completed by ``data``; a picture that is cut off or too long does not end in FF D9."""
+        """Return the pictures completed by ``data``; a truncated or oversized picture does not end with FF D9."""
         self._buffer += data
         found: list[bytes] = []
         while True:
@@ -44,7 +44,7 @@ class PictureSplitter:
             del self._buffer[:end]
 
     def _end(self) -> int | None:
-        """Where the first picture ends; None if that has not come yet."""
+        """End of the first picture; None if it has not arrived yet."""
         buffer, at = self._buffer, len(SOI)
         while at + 4 <= len(buffer):
             if buffer[at] != 0xFF:
@@ -60,7 +60,7 @@ class PictureSplitter:
 
 
 def size_of(picture: bytes) -> tuple[int, int] | None:
-    """Return width and height (pixels) by the frame header; None without one."""
+    """Return width and height (pixels) from the frame header; None if there is none."""
     at = len(SOI)
     while at + 9 <= len(picture) and picture[at] == 0xFF:
         if picture[at + 1] in _FRAME:
@@ -88,17 +88,17 @@ class HttpHead:
     status: int
     reason: str
     kind: str
-    """Content type, in lower case, without parameters."""
+    """Content type, lower case, without parameters."""
     chunked: bool
     length: int | None
-    """Bytes of the content; None: not given."""
+    """Length of the content (bytes); None if not given."""
 
     @classmethod
     def of(cls, head: bytes) -> "HttpHead":
         """Decode a head without its final empty line.
 
         Raises:
-            ValueError: no answer of an HTTP server.
+            ValueError: not the answer of an HTTP server.
         """
         first, *lines = head.decode("latin-1").split("\r\n")
         if (status := re.fullmatch(r"HTTP/1\.[01] (\d{3})(?: (.*))?", first)) is None:
@@ -112,19 +112,19 @@ class HttpHead:
 
 @dataclass(slots=True)
 class Dechunker:
-    """Incremental decoder of the chunked coding."""
+    """Incremental decoder of the chunked transfer coding."""
 
     ended: bool = False
-    """Whether the last chunk has come."""
+    """Whether the last chunk has arrived."""
     _buffer: bytes = b""
     _left: int = 0
-    """Bytes of the chunk still to come, with the line end behind it."""
+    """Remaining bytes of the chunk, including its line end."""
 
     def feed(self, data: bytes) -> bytes:
-        """Return the content of ``data``.
+        """Decode ``data``.
 
         Raises:
-            ValueError: no length of a chunk where one must be.
+            ValueError: a chunk length is missing.
         """
         self._buffer += data
         out = b""

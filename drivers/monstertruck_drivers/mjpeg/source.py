@@ -44,13 +44,13 @@ class LinkSource:
         self._clock = clock
 
     async def open(self, mode: Mode, buffers: int) -> FrameStream:
-        """Connect and wait for a picture, whose size counts as granted; see ``FrameSource``.
+        """Connect and wait for a picture, whose size is taken as the granted mode; see ``FrameSource``.
 
         Raises:
-            DeviceLostError: no program, no server, or it ended.
-            DeviceTimeoutError: no picture within the watchdog's time.
+            DeviceLostError: the program or server is missing, or it ended.
+            DeviceTimeoutError: no picture within ``watchdog``.
             DeviceMismatchError: the server refuses the path.
-            WrongDeviceError: the server gives something else than pictures.
+            WrongDeviceError: the server sends other content than pictures.
             ProtocolError: no HTTP.
         """
         del buffers
@@ -67,7 +67,7 @@ class LinkSource:
         return stream
 
     async def connect(self) -> "_Connection":
-        """Open the port and, with HTTP, send the request and take the head of the answer; raises as ``open``."""
+        """Open the port and, with HTTP, send the request and read the answer's header; raises as ``open``."""
         link = await self._port.open()
         if self._config.http is None:
             return _Connection(self.name, link)
@@ -98,7 +98,7 @@ class LinkSource:
         return found
 
     def frame(self, number: int, data: bytes) -> CameraFrame:
-        """Return a picture that arrived now."""
+        """Return a frame that arrived now."""
         return CameraFrame(self._clock.now() - round(self._config.delay * SECOND), number, data)
 
     def splitter(self) -> PictureSplitter:
@@ -106,12 +106,12 @@ class LinkSource:
         return PictureSplitter(self._config.most)
 
     def schedule(self) -> Schedule:
-        """Return the instants of polling."""
+        """Return the polling schedule."""
         return Schedule(self._clock, self._config.poll or 1.0)
 
 
 class _Connection:
-    """One answer."""
+    """Connection for one answer."""
 
     def __init__(self, name: str, link: Link, head: HttpHead | None = None, rest: bytes = b"") -> None:
         self.link = link
@@ -122,7 +122,7 @@ class _Connection:
 
     @property
     def ended(self) -> bool:
-        """Whether all content has come, by its length or the last chunk."""
+        """Whether all content has arrived, by its length or the last chunk."""
         return self._left == 0 or (self._chunks is not None and self._chunks.ended)
 
     async def read(self) -> bytes:
@@ -139,7 +139,7 @@ class _Connection:
 
 
 class _Pictures(ABC):
-    """Base of both streams; the first picture is taken at the start and given by the first ``next``."""
+    """Base of both streams; it takes the first picture at the start, and the first ``next`` returns it."""
 
     def __init__(self, source: LinkSource, mode: Mode) -> None:
         self.mode = mode
@@ -164,7 +164,7 @@ class _Pictures(ABC):
         """Wait for the next picture."""
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         if self._connection is not None:
             self._connection.link.close()
 
@@ -176,7 +176,7 @@ class _Pictures(ABC):
 
 
 class _Streamed(_Pictures):
-    """Images in sequence."""
+    """Stream of pictures on one connection."""
 
     async def _take(self) -> CameraFrame:
         if self._connection is None:
@@ -189,7 +189,7 @@ class _Streamed(_Pictures):
 
 
 class _Polled(_Pictures):
-    """One connection for every picture."""
+    """Stream with one connection per picture."""
 
     def __init__(self, source: LinkSource, mode: Mode) -> None:
         super().__init__(source, mode)

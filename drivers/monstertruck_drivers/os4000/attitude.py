@@ -14,15 +14,15 @@ Real = TypeVar("Real", float, NDArray[np.float64])
 
 
 def level_field(field: tuple[Real, Real, Real], pitch: Real, roll: Real, iron: IronConfig) -> tuple[Real, Real]:
-    """Horizontal part of the earth's field, forward and left, as it would be felt on level ground.
+    """Return the horizontal component of the earth's field (forward, left), compensated for tilt.
 
-    The heading, clockwise from magnetic north, is its angle: north lies to the left of a truck that has turned right.
+    Its angle is the heading, clockwise from magnetic north: north lies to the left of a truck that has turned right.
 
     Args:
         field: measured along the device's x (forward), y (left), z (up).
         pitch: nose down positive (REP 103) (rad).
         roll: right side down positive (rad).
-        iron: what to take out; hard iron in the unit of ``field``.
+        iron: calibration to apply; hard iron in the unit of ``field``.
     """
     x, y = field[0] - iron.hard_x, field[1] - iron.hard_y
     x, y = iron.soft_xx * x + iron.soft_xy * y, iron.soft_xy * x + iron.soft_yy * y
@@ -32,7 +32,7 @@ def level_field(field: tuple[Real, Real, Real], pitch: Real, roll: Real, iron: I
 
 
 MILLIGAUSS: Final = 0.1
-"""Microtesla in 1 mG."""
+"""Microtesla per milligauss."""
 
 
 def to_attitude(sentence: Sentence, config: Os4000Config, stamp: int, received: int, seq: int) -> Attitude:
@@ -40,13 +40,13 @@ def to_attitude(sentence: Sentence, config: Os4000Config, stamp: int, received: 
 
     The device counts pitch nose up and roll right side down; REP 103 counts pitch nose DOWN (about y, left) and
     roll right side down (about x, forward), so that only pitch changes its sign. Its acceleration is +1 g along z
-    (up) at rest, with x forward and y left (a maker's sample of pitch 2.5 and roll -14 degrees shows it).
+    (up) at rest, with x forward and y left (as a sample of the manufacturer with pitch 2.5 and roll -14 degrees shows).
 
     With a calibrated ``iron`` the heading comes from the field instead; ``magnetic_field`` stays as measured.
 
     Raises:
-        ValueError: heading, pitch or roll (or the field, where it is needed) is absent or out of range; the text says
-            which.
+        ValueError: heading, pitch or roll (or the field, where it is needed) is absent or out of range; the text names
+            it.
     """
     heading, pitch, roll = sentence.heading, sentence.pitch, sentence.roll
     if heading is None or not 0 <= heading < 360:

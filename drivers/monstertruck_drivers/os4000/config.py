@@ -8,18 +8,18 @@ from monstertruck_drivers.os4000.protocol import RATE_MAX, Fields
 from monstertruck_schemas.base import FrameId, Positive, Schema
 
 NEEDED = Fields.HEADING | Fields.PITCH | Fields.ROLL
-"""Without these there is no attitude."""
+"""Fields required for an attitude."""
 
 
 class IronConfig(Schema):
-    """The truck's own magnetism, to be taken out of the measured field: ``soft (field - hard)``, device axes.
+    """Compensation of the truck's own magnetism in the measured field: ``soft (field - hard)``, device axes.
 
-    As calibrated on level ground: the vertical field is left as it is, and ``soft`` is scaled to determinant 1. With
-    the values below the unit's own heading is used; with any others it is computed here.
+    Calibrated on level ground: the vertical field is unchanged, and ``soft`` is scaled to determinant 1. With the
+    default values the driver uses the unit's own heading; with other values it computes the heading.
     """
 
     hard_x: float = 0.0
-    """Microtesla, in the unit's own scale"""
+    """Hard iron along x (microtesla), in the unit's own scale"""
     hard_y: float = 0.0
     """Hard iron along y (microtesla), in the unit's own scale"""
     soft_xx: Positive = 1.0
@@ -39,19 +39,19 @@ class IronConfig(Schema):
 class Os4000Config(Schema):
     """OceanServer OS4000 compass.
 
-    Rate, fields and format are written to the unit only where it behaves otherwise. Declination must be zero in the
+    The driver writes rate, fields and format only if the unit behaves otherwise. Declination must be zero in the
     unit, so that its headings refer to magnetic north.
     """
 
     kind: Literal["os4000"] = "os4000"
     rate: Annotated[int, Field(ge=1, le=RATE_MAX)] = 20
-    """Sentences a second; all fields at 19200 baud allow 24."""
+    """Sentence rate (Hz); all fields at 19200 baud allow 24."""
     fields: Annotated[int, Field(ge=0, le=511)] = 335
     """Field mask; 335 = heading, pitch, roll, temperature, magnetic field, acceleration."""
     delay: Annotated[float, Field(ge=0, le=1)] = 0.04
-    """Age of a measurement when its last byte arrives: 80 bytes at 19200 baud."""
+    """Age of a measurement when its last byte arrives (s): 80 bytes at 19200 baud."""
     silence: Positive = 0.5
-    """Seconds without a correct sentence that end the session; never less than five periods."""
+    """Time without a valid sentence after which the session ends (s); at least five periods."""
     field_strength: Positive | None = None
     """Magnitude of the magnetic field at the place of calibration (microtesla); None: not checked."""
     field_tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.25
@@ -61,7 +61,7 @@ class Os4000Config(Schema):
     gravity_tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.2
     """Tolerance of the acceleration (fraction of 1 g); beyond it, roll and pitch are not tilt."""
     frame: FrameId = "base"
-    """Frame whose axes the unit is mounted along."""
+    """Frame whose axes match the unit's mounting."""
 
     @model_validator(mode="after")
     def _fields_make_an_attitude(self) -> Self:
@@ -73,5 +73,5 @@ class Os4000Config(Schema):
 
     @property
     def timeout(self) -> float:
-        """Seconds without a correct sentence that end the session."""
+        """Time without a valid sentence after which the session ends (s)."""
         return max(self.silence, 5 / self.rate)

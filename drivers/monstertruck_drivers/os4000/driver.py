@@ -14,17 +14,17 @@ from monstertruck_schemas.sensor import Attitude
 
 
 class Os4000Driver:
-    """Listens; writes a setting only where the unit behaves otherwise than configured.
+    """Receives the unit's stream; writes a setting only if the unit deviates from the configuration.
 
-    Baud rates are not searched: a port opens at its configured rate, and a unit at another one shows as bytes
-    without a sentence. Stamps are arrival times minus ``config.delay``; the unit has no clock.
+    The driver does not search for the baud rate: the port opens at its configured rate, and a unit with another rate
+    yields bytes without a sentence. Stamps are arrival times minus ``config.delay``; the unit has no clock.
 
     Args:
         config: rate, fields and checks.
         port: the compass's port.
         clock: time.
         out: attitudes, REP 103 signs.
-        events: settings written, sentences refused.
+        events: settings written, rejected sentences.
         name: service name.
     """
 
@@ -45,7 +45,7 @@ class Os4000Driver:
         self._events = events
         self._refusing = False
         self._written: dict[Key, int] = {}
-        """When each setting was written (ns)."""
+        """Time when each setting was written (ns)."""
 
     async def run(self, ready: Ready) -> None:
         """Serve one session.
@@ -53,8 +53,8 @@ class Os4000Driver:
         Raises:
             DeviceLostError: unplugged.
             DeviceTimeoutError: silence.
-            ProtocolError: bytes without a correct sentence, or sentences without heading, pitch and roll.
-            WrongDeviceError: nothing that comes at the start is an OS4000's sentence.
+            ProtocolError: bytes without a valid sentence, or sentences without heading, pitch and roll.
+            WrongDeviceError: the bytes at the start contain no sentence of an OS4000.
             PortBusyError: another process holds the port.
         """
         async with await self._port.open() as link:
@@ -66,7 +66,7 @@ class Os4000Driver:
     async def _set_up(self, session: Os4000Session) -> None:
         heard = await session.start(self._config.rate, self._may_write)
         wrong = self._differences(heard)
-        # Looks at the stream that must agree before a setting is written: one may fall into a pause of the host.
+        # Readings of the stream that must agree before a setting is written: one may fall into a pause of the host.
         looks = 2
         for _ in range(looks - 1):
             if not wrong:
@@ -89,7 +89,7 @@ class Os4000Driver:
     def _may_write(self, key: Key) -> bool:
         """Whether a setting may be written again; marks it as written."""
         now, before = self._clock.now(), self._written.get(key)
-        # Minimum seconds between two writes of one setting: the memory wears, and each write pauses the stream.
+        # Minimum interval between two writes of one setting (s): the memory wears, and each write pauses the stream.
         setting_period = 3600.0
         if before is not None and now - before < setting_period * SECOND:
             return False
@@ -97,7 +97,7 @@ class Os4000Driver:
         return True
 
     def _differences(self, heard: list[tuple[int, Sentence]]) -> dict[Key, tuple[int, str]]:
-        """Settings that differ: key to configured value and a text."""
+        """Settings that differ from the configuration: key to configured value and a text."""
         config = self._config
         wrong: dict[Key, tuple[int, str]] = {}
         fields = observed_fields(heard)
@@ -129,7 +129,7 @@ class Os4000Driver:
                 limit, heard = self._clock.now() + timeout, stream.bytes_heard
 
     def _publish(self, sentences: list[Sentence]) -> bool:
-        """Publish the usable sentences; space sentences from one burst by the period."""
+        """Publish the usable sentences; space the sentences of one burst by the period."""
         received = self._clock.now()
         newest = received - round(self._config.delay * SECOND)
         usable = False

@@ -1,4 +1,4 @@
-"""The device side of an OS4000, byte for byte."""
+"""Device side of an OS4000, byte for byte."""
 
 import asyncio
 import math
@@ -43,7 +43,7 @@ class Settings:
     temperature_offset: int = 0
 
     def store(self, key: Key, number: int) -> bool:
-        """Write one setting; False = value refused."""
+        """Write one setting; return False if the value is refused."""
         match key:
             case Key.RATE if RATE_MIN <= number <= RATE_MAX:
                 self.rate = number
@@ -67,12 +67,12 @@ REPORTED: Final = (
     *("heading", "pitch", "roll", "temperature"),
     *("field_x", "field_y", "field_z", "acceleration_x", "acceleration_y", "acceleration_z"),
 )
-"""Numbers of a sentence."""
+"""Numbers in a sentence."""
 CALIBRATION_KEYS: Final = (Key.CALIBRATE_LEVEL, Key.CALIBRATE_VERTICAL)
 
 
 class Os4000Emulator(FaultyDevice):
-    """OS4000-T that streams from power-up on.
+    """OS4000-T that streams from power-up.
 
     Faults (``inject``): ``frozen on|off`` (repeats one sentence), ``silent on|off``, ``bad_checksum N``,
     ``empty_field TAG`` and ``nan_field TAG`` (TAG ``none`` ends it), ``half_sentence``, ``prompt`` (stray text),
@@ -152,7 +152,7 @@ class Os4000Emulator(FaultyDevice):
             self._end.baud = self._baud
 
     def power_cycle(self) -> None:
-        """Supply off and on: an open command is forgotten, a stored baud rate becomes active."""
+        """Switch the supply off and on: an open command is dropped, a stored baud rate becomes active."""
         self._boot()
 
     async def run(self, end: DeviceEnd) -> None:
@@ -311,7 +311,7 @@ def _prompt(command: Key) -> bytes:
 
 
 def _replace_field(line: bytes, tag: str, text: str) -> bytes:
-    """Put ``text`` in the place of a field's number, with a correct sum."""
+    """Replace a field's number by ``text``, with a correct checksum."""
     body = line[1 : line.index(b"*")].decode("ascii")
     start = body.find(tag)
     if start < 0:
@@ -324,5 +324,5 @@ def _replace_field(line: bytes, tag: str, text: str) -> bytes:
 
 
 def emulated(setup: EmulatorSetup) -> Os4000Emulator:
-    """The compass of a simulated truck."""
+    """Create the compass of a simulated truck."""
     return Os4000Emulator(setup.clock, setup.physics.compass, seed=setup.seed)

@@ -1,6 +1,6 @@
-"""Sentences and commands of the OS4000: format 1, found by tags, guarded by an XOR sum.
+"""Sentences and commands of the OS4000: format 1, with tagged fields and an XOR checksum.
 
-Source: maker's user guides of the OS4000 and OS5000 series (same command family).
+Source: manufacturer's user guides of the OS4000 and OS5000 series (same command family).
 """
 
 import math
@@ -13,15 +13,15 @@ from typing import Final
 
 ESC: Final = 0x1B
 SENTENCE_LIMIT: Final = 200
-"""Bytes without a line end after which the collected bytes are dropped."""
+"""Number of bytes without a line end after which the collected bytes are dropped."""
 
 FACTORY_BAUD: Final = 19200
-"""Baud rate of a unit as delivered; the kind's row in the catalog makes it the default of a port."""
+"""Factory baud rate; the kind's row in the catalog makes it the default of a port."""
 BAUDS: Final = (4800, 9600, 14400, 19200, 38400, 57600, 115200)
-"""Baud rates by the value the baud command takes; a change acts from the next power-up on."""
+"""Baud rates by the value of the baud command; a change takes effect at the next power-up."""
 RATE_MIN: Final = -100
 RATE_MAX: Final = 40
-"""Sentences a second; negative: seconds a sentence; 0: none."""
+"""Maximum value of the rate command (sentences/s); negative: seconds per sentence; 0: none."""
 
 
 class Fields(IntFlag):
@@ -39,7 +39,7 @@ class Fields(IntFlag):
 
 
 class Key(IntEnum):
-    """Command keys, sent behind ESC."""
+    """Command keys, sent after ESC."""
 
     FACTORY_BAUD = ord("B")
     RATE = ord("R")
@@ -62,20 +62,20 @@ Xyz = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Sentence:
-    """One sentence in the device's units; a field that was not sent, or not as a number, is None."""
+    """One sentence in the device's units; a field that is missing or not a number is None."""
 
     heading: float | None = None
-    """Degrees clockwise from magnetic north."""
+    """Heading, clockwise from magnetic north (degrees)."""
     pitch: float | None = None
-    """Degrees, nose up positive."""
+    """Pitch, nose up positive (degrees)."""
     roll: float | None = None
-    """Degrees, right side down positive."""
+    """Roll, right side down positive (degrees)."""
     temperature: float | None = None
-    """Degrees Celsius."""
+    """Temperature (degrees Celsius)."""
     depth: float | None = None
     field_length: float | None = None
     field: Xyz | None = None
-    """Milligauss, if the unit was calibrated with the local field strength."""
+    """Magnetic field (milligauss), if the unit was calibrated with the local field strength."""
     acceleration_length: float | None = None
     acceleration: Xyz | None = None
     """Acceleration (g)."""
@@ -105,15 +105,15 @@ def checksum(body: bytes) -> int:
 
 
 _FRAME = re.compile(rb"\$([^$*]*)\*([0-9A-Fa-f]{1,2})\s*")
-# The longer tag first: Mx before M, Ax before A.
+# Longer tags first: Mx before M, Ax before A.
 _TAG = re.compile(r"(Mx|My|Mz|Ax|Ay|Az|[CPRTDMA])((?:[+-]?(?:\d+\.?\d*|\.\d+|(?i:nan|inf)))?)")
 
 
 def parse(line: bytes) -> Sentence:
-    """Read one sentence, with or without its line end.
+    """Parse one sentence, with or without its line end.
 
     Raises:
-        ValueError: no sentence, wrong sum, unknown or repeated tag; the text names the error.
+        ValueError: not a sentence, wrong checksum, unknown or repeated tag; the text names the error.
     """
     frame = _FRAME.fullmatch(line)
     if frame is None:
@@ -152,16 +152,16 @@ def _vector(values: dict[str, float | None], tag: str) -> Xyz | None:
 
 
 def frame(body: str) -> bytes:
-    """A sentence's bytes around its tagged fields."""
+    """Frame the tagged fields of a sentence."""
     raw = body.encode("ascii")
     return b"$%s*%02X\r\n" % (raw, checksum(raw))
 
 
 def build(sentence: Sentence, *, mask: Fields | None = None) -> bytes:
-    """Bytes of a sentence as the device prints them.
+    """Encode a sentence as the device prints it.
 
     Args:
-        sentence: values; those that are None are left out.
+        sentence: values; None values are omitted.
         mask: print only these fields.
     """
     one, two, three = "{}{:.1f}", "{}{:.2f}", "{}{:.3f}"
@@ -188,31 +188,31 @@ def build(sentence: Sentence, *, mask: Fields | None = None) -> bytes:
 
 
 def key(command: Key) -> bytes:
-    """An immediate command, or the opening of one that takes a value."""
+    """Encode an immediate command, or the start of a command that takes a value."""
     return bytes((ESC, command))
 
 
 def value(number: int) -> bytes:
-    """The value of an opened command, ended by a space."""
+    """Encode the value of a started command, terminated by a space."""
     return b"%d " % number
 
 
 @dataclass(slots=True)
 class Os4000Parser:
-    """Extracts sentences from a byte stream, however it is cut; bounded, never stuck.
+    """Extracts sentences from a byte stream in chunks of any size; its buffer is bounded.
 
     Other text (prompts, answers, other formats) is kept in ``text`` until taken.
     """
 
     good: int = 0
     bad: int = 0
-    """Number of lines with a ``$`` but no correct sentence, and of floods without line end."""
+    """Number of lines with a ``$`` but without a valid sentence, and of floods without a line end."""
     text: list[bytes] = field(default_factory=list)
     """Latest lines without ``$``, and sentences of other formats."""
     _buffer: bytearray = field(default_factory=bytearray)
 
     def feed(self, data: bytes) -> list[Sentence]:
-        """All sentences that became complete."""
+        """Return the completed sentences."""
         sentences: list[Sentence] = []
         self._buffer += data
         while True:
@@ -229,7 +229,7 @@ class Os4000Parser:
                 sentences.append(sentence)
 
     def _line(self, line: bytes) -> Sentence | None:
-        # A line may begin with the torn rest of an earlier one, or with a prompt.
+        # A line may start with the rest of a truncated line, or with a prompt.
         start = line.rfind(b"$")
         if start > 0 or (start < 0 and line.strip()):
             self._keep(line if start < 0 else line[:start])
@@ -252,5 +252,5 @@ _OTHER_FORMAT = re.compile(rb"\$(OHPR|HCHDT),.*|[-+.\d]+(,[-+.\d]*)+", re.DOTALL
 
 
 def is_other_format(line: bytes) -> bool:
-    """Whether a line looks like a compass that was set to one of its other sentence formats."""
+    """Whether a line looks like another sentence format of the compass."""
     return _OTHER_FORMAT.fullmatch(line.strip()) is not None

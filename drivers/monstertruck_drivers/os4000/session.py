@@ -1,4 +1,4 @@
-"""Listening to an OS4000 and setting it up over one open link; shared by the driver and `identify`."""
+"""Receives from an OS4000 and sets it up over one open link; shared by the driver and `identify`."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -13,9 +13,9 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, WrongDeviceError
 
 LISTEN: Final = 1.2
-"""Seconds to receive a sentence of a streaming unit; also longer than it pauses after a setting."""
+"""Time limit for the first sentence of a streaming unit (s); longer than its pause after a setting."""
 LEAVE: Final = b"\x1b\r"
-"""ESC leaves a command; where there was none it begins one, which CR, being no key, leaves again."""
+"""ESC leaves a command. If none is open, ESC opens one, and CR, which is not a key, leaves it."""
 
 
 class Os4000Session:
@@ -29,12 +29,12 @@ class Os4000Session:
     def __init__(self, link: Link, clock: Clock) -> None:
         self.parser = Os4000Parser()
         self.stream = DeviceStream(link, clock, self.parser.feed)
-        """Sentences."""
+        """Stream of sentences."""
         self._link = link
         self._clock = clock
 
     async def listen(self, seconds: float, count: int = 6) -> list[tuple[int, Sentence]]:
-        """Collect sentences with their arrival times until ``count`` came or ``seconds`` passed."""
+        """Collect sentences with their arrival times until ``count`` have arrived or ``seconds`` have passed."""
         heard: list[tuple[int, Sentence]] = []
         try:
             async with self._clock.deadline(seconds):
@@ -45,23 +45,23 @@ class Os4000Session:
         return heard
 
     async def start(self, rate: int, may_set: Callable[[Key], bool] = lambda _: True) -> list[tuple[int, Sentence]]:
-        """Bring the unit to talk, whatever state it was left in.
+        """Make the unit send sentences, from any state it was left in.
 
-        It may stream; wait inside an unfinished command; have its output switched off (that is stored); or print
-        another format. Only a silent unit, or one that prints a known other format, is written to. Baud rates
-        other than the port's are not tried: a port cannot change its rate.
+        The unit may stream, wait inside an unfinished command, have its output switched off (a stored setting), or
+        print another format. The session writes only to a silent unit or to one that prints another known format. It
+        tries only the port's baud rate, because a port cannot change its rate.
 
         Args:
-            rate: sentences a second to set when the output is off.
-            may_set: asked before a setting is written.
+            rate: sentence rate to set if the output is off (Hz).
+            may_set: called before a setting is written; returns whether it may be.
 
         Returns:
             At least one sentence, with arrival times.
 
         Raises:
             DeviceLostError: unplugged.
-            DeviceTimeoutError: silence to the end.
-            WrongDeviceError: bytes come, but no sentence of an OS4000.
+            DeviceTimeoutError: silence.
+            WrongDeviceError: bytes arrive, but no sentence of an OS4000.
         """
         # The content of a half-typed command must not become its value: leave the command before ending anything.
         set_rate = protocol.key(Key.RATE) + protocol.value(rate)
@@ -91,9 +91,10 @@ class Os4000Session:
         )
 
     async def set(self, command: Key, number: int) -> None:
-        """Write one setting; afterwards sentences come again.
+        """Write one setting and return to streaming.
 
-        Which end of value a firmware takes is not certain: space first, then CR, and ESC to leave in any case.
+        Firmware versions may differ in the terminator of a value: this sends a space, then CR, and finally ESC to leave
+        the command.
 
         Raises:
             DeviceLostError: unplugged.
@@ -106,7 +107,7 @@ class Os4000Session:
                 return
 
     async def ask(self, command: Key, seconds: float = 0.5) -> list[str]:
-        """Text that an immediate command prints."""
+        """Return the text that an immediate command prints."""
         self.parser.text = []
         self._link.write(protocol.key(command))
         await self.listen(seconds, count=1000)
@@ -114,7 +115,7 @@ class Os4000Session:
 
 
 def observed_fields(heard: list[tuple[int, Sentence]]) -> Fields:
-    """All fields seen: a field may be empty in one sentence."""
+    """Return all fields seen; a field may be empty in a single sentence."""
     mask = Fields(0)
     for _, sentence in heard:
         mask |= sentence.fields
@@ -131,7 +132,7 @@ def observed_rate(heard: list[tuple[int, Sentence]]) -> float | None:
 
 
 async def identify(link: Link, clock: Clock, settings: Os4000Config) -> dict[str, object]:
-    """Listen, and ask for the firmware version; only a silent unit is set to another rate.
+    """Receive sentences and request the firmware version; only a silent unit is set to another rate.
 
     Returns:
         JSON-able: ``version`` (lines that the unit prints), ``rate`` (Hz), ``fields`` (names), ``sample`` in the
@@ -139,7 +140,7 @@ async def identify(link: Link, clock: Clock, settings: Os4000Config) -> dict[str
 
     Raises:
         DeviceTimeoutError: silence.
-        WrongDeviceError: another device, or another baud rate than the port's.
+        WrongDeviceError: another device, or a baud rate other than the port's.
     """
     session = Os4000Session(link, clock)
     heard = await session.start(20)  # rate that a unit gets whose output is off

@@ -32,26 +32,26 @@ class Pca9685Config(Schema):
 
     kind: Literal["pca9685"] = "pca9685"
     address: Annotated[int, Field(ge=ADDRESSES[0], le=ADDRESSES[-1])] = ADDRESS
-    """7-bit address, by the solder bridges of the board"""
+    """7-bit address, set by the solder bridges of the board"""
     front: Pca9685Servo = Pca9685Servo()
     rear: Pca9685Servo | None = None
     """Servo of the rear axle; null: it does not steer"""
     frequency: Annotated[float, Field(ge=40, le=330)] = 50.0
-    """Pulses a second; analog servos and most speed controllers take 50. The resolution of a pulse is 1/4096 of the
+    """Pulse rate (Hz); analog servos and most speed controllers expect 50. The resolution of a pulse is 1/4096 of the
     cycle"""
     oscillator: Annotated[float, Field(ge=23e6, le=27e6)] = OSCILLATOR
-    """Frequency of this chip's oscillator, Hz: measure the frequency of a pulse and set oscillator = 4096 times that
+    """Frequency of this chip's oscillator (Hz): measure the frequency of a pulse and set oscillator = 4096 times that
     times (prescaler + 1), which ``probe`` prints. An error of 4 % moves a neutral pulse by 60 us"""
     dead_time: Annotated[float, Field(ge=0, le=1)] | None = None
     """Dead time from a steering command to the first movement of the wheels (s); null if it was not measured"""
     lag: Annotated[float, Field(ge=0, le=1)] | None = None
     """Time constant of the wheels' movement after the dead time (s); null if it was not measured"""
     poll_rate: Annotated[float, Field(gt=0, le=50)] = 20.0
-    """Times a second the registers are read back"""
+    """Rate at which the registers are read back (Hz)"""
     answer_timeout: Annotated[float, Field(gt=0, le=1)] = 0.1
     """Timeout of one transfer on the bus (s)"""
     command_timeout: Annotated[float, Field(gt=0, le=2)] = 0.25
-    """Maximum age of a command (s); then the servos hold and the motor gets its neutral pulse"""
+    """Maximum age of a command (s); then the servos hold and the motor receives its neutral pulse"""
 
     @cached_property
     def prescale(self) -> int:
@@ -59,16 +59,16 @@ class Pca9685Config(Schema):
         return prescale(self.frequency, self.oscillator)
 
     def counts(self, pulse_us: float) -> int:
-        """Length of a pulse in counts."""
+        """Convert a pulse length (us) to counts."""
         return round(pulse_us / count_us(self.prescale, self.oscillator))
 
     def pulse_us(self, counts: int) -> float:
-        """Length of a pulse (us)."""
+        """Convert counts to a pulse length (us)."""
         return counts * count_us(self.prescale, self.oscillator)
 
     @property
     def servos(self) -> tuple[Pca9685Servo, ...]:
-        """Servos that are there."""
+        """Configured servos."""
         return (self.front,) if self.rear is None else (self.front, self.rear)
 
     @property
@@ -79,7 +79,7 @@ class Pca9685Config(Schema):
 
     @property
     def battery(self) -> None:
-        """The chip measures nothing."""
+        """None: the chip measures nothing."""
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
@@ -111,7 +111,7 @@ class Pca9685EscConfig(Schema):
 
     @property
     def battery(self) -> None:
-        """The chip measures nothing."""
+        """None: the chip measures nothing."""
 
     @property
     def command_timeout(self) -> float:

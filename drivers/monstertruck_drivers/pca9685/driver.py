@@ -20,9 +20,9 @@ from monstertruck_schemas.sensor import Battery, DriveFeedback, SteeringFeedback
 class Pca9685Driver:
     """Sends every steering command at once, and reads the registers back in between.
 
-    **No watchdog.** The chip repeats the latest pulses until it gets others or loses its supply, even while the
-    computer hangs. Stale commands: the servos hold. Registers that differ from what was written, as after a loss of the
-    chip's supply, are written again, with an event.
+    **No watchdog.** The chip repeats the latest pulses until it receives others or loses its supply, even while the
+    computer hangs. When commands are stale, the servos hold. If registers differ from the written values, as after a
+    loss of the chip's supply, the driver writes them again and reports an event.
 
     Args:
         config: calibration and rates.
@@ -63,12 +63,13 @@ class Pca9685Driver:
         """Serve one session.
 
         Raises:
-            DeviceLostError: no such bus, or it is gone.
+            DeviceLostError: no such bus, or it was removed.
             DeviceTimeoutError: the chip does not acknowledge, three times in a row; at the start: nothing at its
                 address.
             WrongDeviceError: another device has its address.
             PortBusyError: another process holds the emulated bus.
-            DeviceFaultError: a channel that should be at rest reads back otherwise twice in a row; all pulses are off.
+            DeviceFaultError: a channel that should be at rest reads back another value twice in a row; all pulses are
+                off.
         """
         config = self._config
         async with await self._port.open() as link:
@@ -77,7 +78,7 @@ class Pca9685Driver:
             self._command: SteeringCommand | None = None
             self._stale = self._failing = False
             self._sent: dict[int, int] = {}
-            """Counts by channel."""
+            """Latest counts sent, by channel."""
             self._misses = Misses()
             await self._write(session, self._more(rest=True))
             ready()
@@ -105,7 +106,7 @@ class Pca9685Driver:
         return self._clock.now() - command.stamp <= self._config.command_timeout * SECOND
 
     async def _watch(self, session: Pca9685Session) -> None:
-        """Notice commands that stop coming."""
+        """Report missing commands."""
         if self._command is None or self._stale or self._is_fresh(self._command):
             return
         self._stale = True
@@ -119,15 +120,15 @@ class Pca9685Driver:
         return {servo.channel: self._config.counts(servo.pulse_us(angle)) for servo, angle in pairs}
 
     def _more(self, *, rest: bool = False) -> dict[int, int]:
-        """Counts by channel of what else hangs on the chip; ``rest`` brings it to rest."""
+        """Counts by channel of other devices on the chip; ``rest`` stops them."""
         del rest
         return {}
 
     def _restarted(self) -> None:
-        """Take note that the chip has lost its settings, and with them its pulses."""
+        """Handle a chip that has lost its settings, and with them its pulses."""
 
     def _polled(self, stamp: int, received: int) -> None:
-        """Publish what else is known after a poll."""
+        """Publish the feedback of other devices after a poll."""
 
     async def _write(self, session: Pca9685Session, targets: dict[int, int]) -> None:
         """Write pulses; the next poll repeats a write that was lost."""
@@ -136,7 +137,7 @@ class Pca9685Driver:
             await session.write(pulse(channel, counts))
 
     async def _require_rest(self, session: Pca9685Session, differ: list[int]) -> None:
-        """End all pulses if a channel does not come to rest: without them a speed controller lets its motor coast.
+        """Switch off all pulses if a channel does not come to rest, so that a speed controller lets its motor coast.
 
         Raises:
             DeviceFaultError: see ``run``.

@@ -1,4 +1,4 @@
-"""The device side of a PCA9685, register by register, with the servos and the speed controller on its outputs."""
+"""Device side of a PCA9685, register by register, with the servos and the speed controller on its outputs."""
 
 import asyncio
 from typing import Final
@@ -35,27 +35,27 @@ from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
 
 SUB_BITS: Final = (PwmMode1.SUB1, PwmMode1.SUB2, PwmMode1.SUB3, PwmMode1.ALLCALL)
-"""Bits that let the chip answer at the addresses of registers 2 to 5."""
+"""Bits that enable the chip's answers at the addresses in registers 2 to 5."""
 _POSITION: Final = "counts_{}"
 _TARGET: Final = "target_{}"
 
 
 class Pca9685Emulator(FaultyDevice):
-    """A PCA9685 whose supply comes with the bus.
+    """A PCA9685 that the bus supplies.
 
-    Without the auto-increment bit, every byte of a transfer reads or writes the same register. The prescaler takes
-    values in sleep only. Sleep with running outputs sets the restart bit; they stay off after it until that bit is
-    written or their registers are. The data sheet's other ways to answer are here too: sub-addresses, all-call, reset
-    by general call, both full bits, ``ALL_LED`` registers that read as zero.
+    Without the auto-increment bit, every byte of a transfer reads or writes the same register. The prescaler can be set
+    only in sleep. Sleep with running outputs sets the restart bit; the outputs then stay off until that bit or their
+    registers are written. Other features of the data sheet: sub-addresses, all-call, reset by general call, both full
+    bits, ``ALL_LED`` registers that read as zero.
 
     Faults (``inject``): ``brown_out`` (supply off and on), ``absent on|off`` (acknowledges nothing), ``oscillator HZ``.
 
     Args:
         clock: time.
         servos: physics of the servos; None: the pulses move nothing.
-        address: address by its pins.
+        address: address set by its pins.
         oscillator: frequency of its oscillator (Hz).
-        seed: seed of false signals.
+        seed: seed of the signal faults.
     """
 
     def __init__(
@@ -96,9 +96,9 @@ class Pca9685Emulator(FaultyDevice):
         self._registers[PwmRegister.PRE_SCALE] = PRESCALE_RESET
         self._pointer = 0
         self._halted: set[int] = set()
-        """Channels that sleep stopped."""
+        """Channels stopped by sleep."""
         self._awake_at = 0
-        """When the oscillator runs (ns)."""
+        """Time from which the oscillator runs (ns)."""
 
     # Interface to the simulated world
 
@@ -117,7 +117,7 @@ class Pca9685Emulator(FaultyDevice):
         return bytes(self._registers[start : start + 4])
 
     def power_cycle(self) -> None:
-        """Supply off and on: all registers are lost."""
+        """Switch the supply off and on: all registers are lost."""
         self._advance()
         self._boot()
 
@@ -133,7 +133,7 @@ class Pca9685Emulator(FaultyDevice):
     # The bus
 
     def transfer(self, address: int, data: bytes, count: int) -> bytes | None:
-        """Answer one transfer; None: not acknowledged."""
+        """Answer one transfer; None if not acknowledged."""
         if self.faults["absent"] or not self._powered:
             return None
         if address == GENERAL_CALL:
@@ -181,7 +181,7 @@ class Pca9685Emulator(FaultyDevice):
         return value
 
     def _write(self, value: int, wanted: dict[int, bytearray]) -> None:
-        """Take one byte; pulses are collected in ``wanted``, by channel, until the stop condition."""
+        """Process one byte; pulses are collected in ``wanted``, by channel, until the stop condition."""
         register, mode = self._pointer, self._registers[PwmRegister.MODE1]
         self._step()
         channel, part = divmod(register - PwmRegister.LED0_ON_L, 4)
@@ -202,7 +202,7 @@ class Pca9685Emulator(FaultyDevice):
             self._registers[register] = value
 
     def _order(self, channel: int, values: bytes) -> None:
-        """Stop condition: a pulse takes effect, and runs again after sleep."""
+        """Handle the stop condition: a pulse takes effect, and runs again after sleep."""
         start = register_of(channel)
 
         def obey(given: int) -> None:
@@ -232,12 +232,12 @@ class Pca9685Emulator(FaultyDevice):
         self._registers[PwmRegister.MODE1] = value & ~PwmMode1.RESTART & 0xFF | external | restart
 
     def _advance(self) -> None:
-        """Let the servos follow the old pulses up to now."""
+        """Let the servos follow the old pulses until now."""
         if self._servos is not None:
             self._servos.advance(self._clock.now())
 
     def _plugged(self, plugged: bool) -> None:
-        """Its supply comes with the bus."""
+        """Power the chip from the bus."""
         self._powered = plugged
         self.power_cycle()
 
@@ -252,7 +252,7 @@ class Pca9685EscEmulator(Pca9685Emulator):
         plant: the motor.
         servos: physics of the servos.
         settings: channels and pulses.
-        seed: seed of false signals.
+        seed: seed of the signal faults.
     """
 
     def __init__(
@@ -269,14 +269,14 @@ class Pca9685EscEmulator(Pca9685Emulator):
         self._esc = EscEmulator(config.esc, clock, plant, lambda now: self.pulse_us(config.esc.channel, now))
 
     async def run(self, end: DeviceEnd) -> None:
-        """Serve the bus, and let the speed controller read its pulses."""
+        """Serve the bus, and run the speed controller on its pulses."""
         async with asyncio.TaskGroup() as group:
             group.create_task(self._esc.run())
             await super().run(end)
 
 
 def emulated(setup: EmulatorSetup) -> Pca9685Emulator:
-    """The servo controller of a simulated robot."""
+    """Create the servo controller of a simulated robot."""
     config: Pca9685Config = setup.settings or Pca9685Config()
     return Pca9685Emulator(
         setup.clock,
@@ -288,7 +288,7 @@ def emulated(setup: EmulatorSetup) -> Pca9685Emulator:
 
 
 def emulated_esc(setup: EmulatorSetup) -> Pca9685EscEmulator:
-    """The servo and speed controller of a simulated robot."""
+    """Create the servo and speed controller of a simulated robot."""
     return Pca9685EscEmulator(
         setup.clock, setup.physics.motors[0], setup.physics.servos, setup.settings, seed=setup.seed
     )

@@ -1,8 +1,9 @@
 """Driver of a PCA9685 with a speed controller (ESC) on one of its channels: drives and steers.
 
-The pulse follows every command that the gate sends to the servos, so a stop waits for the next tick. Stale commands
-make it neutral, as do start and end of a session. While the computer hangs the chip repeats the latest pulse: it has no
-watchdog. The motor is not measured: the reported rate is the commanded rate, slowed as configured.
+The pulse follows every command that the gate sends to the servos, so a stop waits for the next tick. The pulse becomes
+neutral when commands are stale and at the start and end of a session. The chip has no watchdog: while the computer
+hangs, it repeats the latest pulse. The motor is not measured: the reported rate is the commanded rate, delayed as
+configured.
 """
 
 from monstertruck_drivers.esc import UnmeasuredMotor
@@ -35,7 +36,7 @@ class Pca9685EscDriver(Pca9685Driver):
         out_4: not used.
         steering: pulses being sent, as servo angles.
         battery: not used.
-        events: where faults of the chip are reported.
+        events: faults of the chip.
         name: name of the service.
     """
 
@@ -67,7 +68,7 @@ class Pca9685EscDriver(Pca9685Driver):
         self._motor = UnmeasuredMotor(config.esc, clock, commands, out, config.command_timeout)
 
     async def run(self, ready: Ready) -> None:
-        """Serve one session; raises as ``Pca9685Driver.run``."""
+        """Serve one session; raises the errors of ``Pca9685Driver.run``."""
         self._motor.begin()
         await super().run(ready)
 

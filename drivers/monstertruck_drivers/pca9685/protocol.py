@@ -9,26 +9,26 @@ from enum import IntEnum, IntFlag
 from typing import Final
 
 ADDRESS: Final = 0x40
-"""Address with all address pins low; an INA219 has the same."""
+"""Address with all address pins low, which an INA219 also uses."""
 ADDRESSES: Final = range(0x40, 0x80)
 """Addresses that the six pins select."""
 CHANNELS: Final = 16
 COUNTS: Final = 4096
-"""Counts of a cycle."""
+"""Counts per cycle."""
 OSCILLATOR: Final = 25e6
 """Typical frequency of the internal oscillator (Hz)."""
 PRESCALES: Final = range(3, 256)
-"""Values of the prescaler that the chip takes."""
+"""Valid prescaler values."""
 PRESCALE_RESET: Final = 0x1E
 WAKE_UP: Final = 500e-6
-"""Time that the oscillator needs after sleep (s)."""
+"""Start-up time of the oscillator after sleep (s)."""
 OWN_ADDRESSES: Final = bytes((0xE2, 0xE4, 0xE8, 0xE0))
-"""Values of ``SUBADR1`` to ``ALLCALLADR`` after power-up, left-aligned: the chip has no other identity."""
+"""Values of ``SUBADR1`` to ``ALLCALLADR`` after power-up, left-aligned: they are the chip's only identification."""
 GENERAL_CALL: Final = 0x00
 RESET_BYTE: Final = 0x06
-"""Byte that resets every such chip when it is written to the general call address."""
+"""Byte that resets every PCA9685 when it is written to the general call address."""
 FULL: Final = 0x10
-"""Bit of ``ON_H`` and ``OFF_H``: always on, or always off; off wins."""
+"""Bit of ``ON_H`` and ``OFF_H``: always on, or always off; off takes precedence."""
 
 
 class PwmRegister(IntEnum):
@@ -44,7 +44,7 @@ class PwmRegister(IntEnum):
 
 
 LAST_OF_BLOCK: Final = 0x45
-"""``LED15_OFF_H``: auto-increment goes on at ``MODE1``, as it does after ``PRE_SCALE``."""
+"""``LED15_OFF_H``: auto-increment continues at ``MODE1``, as it does after ``PRE_SCALE``."""
 
 
 class PwmMode1(IntFlag):
@@ -73,10 +73,10 @@ MODE2_RESET: Final = PwmMode2.OUTDRV
 
 
 def prescale(frequency: float, oscillator: float = OSCILLATOR) -> int:
-    """Return the prescaler's value for pulses a second.
+    """Return the prescaler value for a pulse rate (Hz).
 
     Raises:
-        ValueError: the chip cannot divide so.
+        ValueError: the prescaler cannot reach this rate.
     """
     value = round(oscillator / (COUNTS * frequency)) - 1
     if value not in PRESCALES:
@@ -95,7 +95,7 @@ def register_of(channel: int) -> int:
 
 
 def pulse(channel: int, counts: int) -> bytes:
-    """PwmRegister and values of a pulse from the start of the cycle; 0 counts mean no pulse.
+    """Return register and values of a pulse from the start of the cycle; 0 counts mean no pulse.
 
     Raises:
         ValueError: longer than a cycle.
@@ -107,7 +107,7 @@ def pulse(channel: int, counts: int) -> bytes:
 
 
 def counts_of(values: bytes) -> int:
-    """Return the length of a pulse by a channel's four registers, in counts; 0 = none."""
+    """Return the pulse length in counts from a channel's four registers; 0 = none."""
     on, off = int.from_bytes(values[:2], "little"), int.from_bytes(values[2:4], "little")
     if off & FULL << 8:
         return 0

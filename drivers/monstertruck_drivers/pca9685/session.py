@@ -19,7 +19,7 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import WrongDeviceError
 
 AWAKE = PwmMode1.AI
-"""``MODE1`` while serving: outputs run, and the chip answers at its own address alone."""
+"""``MODE1`` while serving: outputs run, and the chip answers only at its own address."""
 
 
 class Pca9685Session:
@@ -39,7 +39,7 @@ class Pca9685Session:
         self._address = address
 
     async def write(self, data: bytes) -> None:
-        """Write registers, the first byte being the address of the first one.
+        """Write registers; the first byte is the address of the first register.
 
         Raises:
             DeviceLostError: the bus is gone.
@@ -56,11 +56,11 @@ class Pca9685Session:
         self._bus.send(self._address, data)
 
     async def read(self, register: int) -> int:
-        """Read a register, whether or not the chip increments; raises as ``write``."""
+        """Read a register, whether or not the chip increments; raises the errors of ``write``."""
         return (await self._bus.transfer(self._address, bytes((register,)), 1))[0]
 
     async def counts(self, channel: int) -> int:
-        """Read the length of a channel's pulse, in counts; raises as ``write``."""
+        """Read the length of a channel's pulse, in counts; raises the errors of ``write``."""
         return counts_of(await self._bus.transfer(self._address, bytes((register_of(channel),)), 4))
 
     async def identify(self) -> tuple[PwmMode1, int]:
@@ -72,7 +72,7 @@ class Pca9685Session:
         Raises:
             DeviceLostError: the bus is gone.
             DeviceTimeoutError: nothing at this address.
-            WrongDeviceError: a device without the sub-addresses of a PCA9685.
+            WrongDeviceError: the device lacks the sub-addresses of a PCA9685.
         """
         found = bytes([await self.read(PwmRegister.SUBADR1 + i) for i in range(len(OWN_ADDRESSES))])
         if found != OWN_ADDRESSES:
@@ -82,7 +82,7 @@ class Pca9685Session:
         return PwmMode1(await self.read(PwmRegister.MODE1)), await self.read(PwmRegister.PRE_SCALE)
 
     async def set_up(self, prescaler: int) -> None:
-        """Let the outputs run at the wanted frequency; pulses that do already are not interrupted.
+        """Run the outputs at the configured frequency; pulses that already run at it are not interrupted.
 
         Raises:
             DeviceLostError: the bus is gone.
@@ -99,11 +99,11 @@ class Pca9685Session:
             await self._clock.sleep(WAKE_UP)
 
     async def sleep(self) -> None:
-        """Stop the oscillator, and with it all pulses; raises as ``write``."""
+        """Stop the oscillator, and with it all pulses; raises the errors of ``write``."""
         await self.write(bytes((PwmRegister.MODE1, AWAKE | PwmMode1.SLEEP)))
 
     async def is_set_up(self, prescaler: int) -> bool:
-        """Whether mode and frequency are those of ``set_up``; raises as ``write``."""
+        """Whether mode and frequency are those of ``set_up``; raises the errors of ``write``."""
         registers = PwmRegister.MODE1, PwmRegister.MODE2, PwmRegister.PRE_SCALE
         return [await self.read(register) for register in registers] == [AWAKE, MODE2_RESET, prescaler]
 
@@ -112,7 +112,7 @@ async def identify(link: Link, clock: Clock, settings: Pca9685Config | Pca9685Es
     """Read the registers without writing.
 
     Returns:
-        JSON-able: ``address``, ``asleep``, ``prescaler``, ``frequency_hz`` by the configured oscillator, ``channels``:
+        JSON-able: ``address``, ``asleep``, ``prescaler``, ``frequency_hz`` for the configured oscillator, ``channels``:
         pulse by channel in microseconds (0 = off).
 
     Raises:

@@ -1,9 +1,9 @@
 """CRSF frames of a receiver (TBS Crossfire, ExpressLRS).
 
-Source: TBS, "CRSF protocol" (github.com/tbs-fpv/tbs-crsf-spec). A frame is an address (C8), the length of what follows,
+Source: TBS, "CRSF protocol" (github.com/tbs-fpv/tbs-crsf-spec). A frame is an address (C8), the length of the rest,
 a type, the payload, and a CRC-8 (polynomial D5, start 0) of type and payload; 64 bytes at most. Type 16 carries the
-channels, type 14 the quality of the radio link: signal of two antennas (dBm without its sign), share of packets (%),
-and more. Without its transmitter an ExpressLRS receiver sends no channels, and a link quality of 0.
+channels, type 14 the quality of the radio link: signal of two antennas (dBm without its sign), fraction of packets
+received (%), and more. Without its transmitter an ExpressLRS receiver sends no channels, and a link quality of 0.
 """
 
 from typing import Final
@@ -56,14 +56,14 @@ def link_frame(quality: float, rssi: float) -> bytes:
 
 
 class CrsfParser:
-    """Collects bytes to messages; frames of other types are skipped."""
+    """Extracts messages from bytes; skips frames of other types."""
 
     def __init__(self) -> None:
         self.refused = 0
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> list[ReceiverFrame]:
-        """Return messages that became complete."""
+        """Return the completed messages."""
         self._buffer += data
         messages = []
         while (body := self._next()) is not None:
@@ -72,7 +72,7 @@ class CrsfParser:
         return messages
 
     def _next(self) -> bytes | None:
-        """Type and payload of the next whole frame; None until more bytes come."""
+        """Return type and payload of the next complete frame; None until more bytes arrive."""
         buffer = self._buffer
         while len(buffer) >= 2:
             size = buffer[1] + 2

@@ -1,4 +1,4 @@
-"""Receiver driver: turns channels into the requests of the operator who stands next to the robot."""
+"""Receiver driver: converts channels into the requests of the operator next to the robot."""
 
 from collections import deque
 from typing import Final
@@ -129,7 +129,7 @@ class ReceiverDriver:
         self._out = out
         self._events = events
         self._said: bool | None = None
-        """Reported state of the transmitter, True = lost; None before the first report."""
+        """Last reported state of the transmitter, True = lost; None before the first report."""
 
     async def run(self, ready: Ready) -> None:
         """Serve one session.
@@ -177,7 +177,7 @@ class ReceiverDriver:
 
 
 async def first_frames(stream: DeviceStream[ReceiverFrame], config: ReceiverConfig) -> list[ReceiverFrame]:
-    """Wait for the first frames of a session; raises as ``DeviceStream.first``."""
+    """Wait for the first frames of a session; raises the errors of ``DeviceStream.first``."""
     # Seconds to receive a frame at the start; a receiver without its transmitter sends link statistics only.
     listen = 1.0
     hint = "another protocol or baud rate" if isinstance(config, CrsfConfig) else "is the signal inverted?"
@@ -191,7 +191,7 @@ async def identify(link: Link, clock: Clock, settings: ReceiverConfig) -> dict[s
         JSON-able: ``channels`` -1 to 1 (None without a transmitter), ``failsafe``, ``link_quality``, ``rssi_dbm``.
 
     Raises:
-        DeviceError: as the driver's ``run``.
+        DeviceError: see the driver's ``run``.
     """
     look = 0.5  # duration of the frame collection (s)
     stream = DeviceStream(link, clock, parser_of(settings).feed)

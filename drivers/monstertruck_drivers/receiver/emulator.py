@@ -106,10 +106,10 @@ class ReceiverEmulator(FaultyDevice):
 
 
 def emulated(setup: EmulatorSetup) -> ReceiverEmulator:
-    """The receiver of a simulated robot."""
+    """Create the CRSF receiver of a simulated robot."""
     return ReceiverEmulator(setup.clock, setup.settings, seed=setup.seed)
 
 
 def emulated_sbus(setup: EmulatorSetup) -> ReceiverEmulator:
-    """SBUS receiver of a simulated robot."""
+    """Create the SBUS receiver of a simulated robot."""
     return ReceiverEmulator(setup.clock, setup.settings or SbusConfig(), seed=setup.seed)

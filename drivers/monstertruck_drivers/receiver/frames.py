@@ -20,10 +20,10 @@ class ReceiverFrame(NamedTuple):
 
 
 class ReceiverParser(Protocol):
-    """Splits the bytes of a receiver into messages."""
+    """Extracts the messages from a receiver's bytes."""
 
     refused: int
-    """Number of bytes that belonged to no message."""
+    """Number of bytes outside of messages."""
 
     def feed(self, data: bytes) -> list[ReceiverFrame]:
-        """Return messages that became complete."""
+        """Return the completed messages."""

@@ -1,4 +1,4 @@
-"""What CRSF and SBUS receivers share, sixteen channels of 11 bits, and the facts of both frames.
+"""Sixteen channels of 11 bits, shared by CRSF and SBUS receivers, and the constants of both frames.
 
 Source: TBS, "CRSF protocol" (frame 0x16): channels follow each other, the lowest bit first; 172, 992 and 1811 are the
 pulses 988, 1500 and 2012 us. SBUS packs its channels the same way.
@@ -8,7 +8,7 @@ from typing import Final
 
 RADIO_CHANNELS: Final = 16
 PACKED: Final = 22
-"""Bytes of all channels."""
+"""Size of all channels (bytes)."""
 BITS: Final = 11
 LOW: Final = 172
 CENTRE: Final = 992
@@ -30,20 +30,20 @@ SBUS_HEADER: Final = 0x0F
 SBUS_LOST: Final = 0x04
 SBUS_FAILSAFE: Final = 0x08
 SBUS_PERIOD: Final = 0.014
-"""Seconds between two frames."""
+"""Frame period (s)."""
 
 ChannelWords = tuple[int, ...]
 """Sixteen raw values, 0 to 2047."""
 
 
 def unpack(data: bytes) -> ChannelWords:
-    """Return the channels of 22 bytes."""
+    """Decode the channels from 22 bytes."""
     bits = int.from_bytes(data[:PACKED], "little")
     return tuple(bits >> BITS * i & _MASK for i in range(RADIO_CHANNELS))
 
 
 def pack(channels: ChannelWords) -> bytes:
-    """Return the 22 bytes of channels."""
+    """Encode the channels as 22 bytes."""
     return sum((value & _MASK) << BITS * i for i, value in enumerate(channels)).to_bytes(PACKED, "little")
 
 

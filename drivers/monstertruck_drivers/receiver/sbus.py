@@ -2,8 +2,8 @@
 
 100000 baud, 8 data bits, even parity, 2 stop bits, the line inverted: an adapter or a transistor must invert it back.
 A frame has 25 bytes, every 7 or 14 ms: 0F, the channels, flags, and 00 (or 04, 14, 24, 34 of SBUS 2). Flag 4 marks
-a lost radio packet, flag 8 the loss of the transmitter. There is no checksum: a wrong bit is a wrong
-position, so a frame after damage is accepted only once the next frame begins where it ends.
+a lost radio packet, flag 8 the loss of the transmitter. There is no checksum, so a wrong bit is a wrong position: after
+damage, a frame is accepted only if the next frame begins where it ends.
 """
 
 from typing import Final
@@ -30,16 +30,16 @@ def frame(channels: ChannelWords, *, lost: bool = False, failsafe: bool = False)
 
 
 class SbusParser:
-    """Collects bytes to messages."""
+    """Extracts messages from bytes."""
 
     def __init__(self) -> None:
         self.refused = 0
         self._buffer = bytearray()
         self._in_step = False
-        """The buffer begins where a frame ended."""
+        """Whether the buffer begins where a frame ended."""
 
     def feed(self, data: bytes) -> list[ReceiverFrame]:
-        """Return messages that became complete."""
+        """Return the completed messages."""
         self._buffer += data
         messages = []
         buffer = self._buffer

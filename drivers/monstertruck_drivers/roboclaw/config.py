@@ -1,4 +1,4 @@
-"""Settings of a RoboClaw as encoder counter."""
+"""Settings of a RoboClaw used as encoder counter."""
 
 import math
 from typing import Annotated, Literal
@@ -10,21 +10,21 @@ from monstertruck_schemas.base import Schema
 
 
 class RoboclawConfig(Schema):
-    """RoboClaw with an encoder on either rear wheel; its outputs for motors stay empty."""
+    """RoboClaw with an encoder on each rear wheel; its motor outputs are unused."""
 
     kind: Literal["roboclaw"] = "roboclaw"
     address: Annotated[int, Field(ge=ADDRESSES[0], le=ADDRESSES[1])] = ADDRESSES[0]
-    """Address of packet serial, 128 to 135"""
+    """Packet serial address, 128 to 135"""
     counts_per_turn: Annotated[int, Field(ge=8, le=1_000_000)] = 4096
-    """Edges of both channels in one turn of the WHEEL"""
+    """Counts (edges of both channels) per turn of the WHEEL"""
     left: Literal[1, 2] = 1
     """Encoder input of the left wheel; the right wheel has the other input"""
     left_inverted: bool = False
-    """Driving forward counts down"""
+    """Whether the left encoder counts down when the robot drives forward"""
     right_inverted: bool = False
-    """The right encoder counts backwards when the robot drives forward"""
+    """Whether the right encoder counts down when the robot drives forward"""
     rate: Annotated[float, Field(ge=5, le=50)] = 25.0
-    """Readings a second"""
+    """Reading rate (Hz)"""
     answer_timeout: Annotated[float, Field(gt=0, le=0.2)] = 0.03
     """Timeout of an answer (s)"""
     max_rate: Annotated[float, Field(gt=0, le=1000)] = 10.0

@@ -1,4 +1,4 @@
-"""Encoder service: counters of two wheels become ``sensor/encoders``."""
+"""Encoder service: publishes the counters of two wheels as ``sensor/encoders``."""
 
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.roboclaw.config import RoboclawConfig
@@ -14,14 +14,14 @@ from monstertruck_schemas.sensor import WheelEncoders
 
 
 class RoboclawDriver:
-    """Asks for both counters; counts are added up over the unit's restarts, so that a position never jumps.
+    """Reads both counters and accumulates their counts across restarts of the unit, so that a position never jumps.
 
     Args:
         config: see ``RoboclawConfig``.
         port: port of the controller.
         clock: time.
         out: angles of the wheels.
-        events: who answers, and its restarts.
+        events: identity and restarts of the unit.
         name: name of the service.
     """
 
@@ -41,16 +41,16 @@ class RoboclawDriver:
         self._out = out
         self._events = events
         self._turned = [0, 0]
-        """Counts of inputs 1 and 2 since the driver was made."""
+        """Accumulated counts of inputs 1 and 2 since the driver was created."""
 
     async def run(self, ready: Ready) -> None:
         """Serve one session.
 
         Raises:
             DeviceLostError: unplugged.
-            DeviceRestartedError: the unit has restarted, and counts from 0.
+            DeviceRestartedError: the unit has restarted and counts from 0.
             DeviceTimeoutError, ProtocolError: no usable answers.
-            WrongDeviceError: something else answers.
+            WrongDeviceError: another device answers.
             PortBusyError: another process holds the port.
         """
         config = self._config

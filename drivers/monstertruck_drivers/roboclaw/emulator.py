@@ -1,7 +1,8 @@
-"""The device side of a RoboClaw with two encoders, byte for byte.
+"""Device side of a RoboClaw with two encoders, byte for byte.
 
-Habits of the real thing: it is silent unless asked, and to a request with another address; drops half a request after
-10 ms; counts from 0 after every power-up; an encoder that is not wired counts nothing, without a word.
+Behaviour of the real unit: it sends only answers, and ignores requests to another address. It drops an incomplete
+request after 10 ms and counts from 0 after every power-up. An encoder that is not wired counts nothing, without an
+error.
 """
 
 from functools import partial
@@ -20,14 +21,14 @@ from monstertruck_runtime.clock import MILLISECOND, SECOND, Clock
 
 VERSION: Final = b"USB RoboClaw 2x7a v4.3.6\n\x00"
 THINKING: Final = MILLISECOND
-"""Ns from a request to its answer."""
+"""Time from a request to its answer (ns)."""
 
 
 class RoboclawEmulator(FaultyDevice):
     """Unit with its encoders wired according to the settings.
 
     Faults (``inject``): ``stuck left|right on|off`` (an encoder's disc slips on its shaft), ``mirrored left|right
-    on|off`` (its channels are exchanged: it counts backwards), ``silent on|off`` (gives no answers), ``noise
+    on|off`` (its channels are swapped: it counts backwards), ``silent on|off`` (no answers), ``noise
     COUNT`` (COUNT answers have a wrong byte), ``reset`` (the supply drops: counters at 0).
 
     Args:
@@ -59,10 +60,10 @@ class RoboclawEmulator(FaultyDevice):
         self._angles: tuple[float, float] | None = None
         """Angles of the wheels at the last reading (rad)."""
         self._counted = [0.0, 0.0]
-        """Left and right, since power-up."""
+        """Counts of the left and right wheel since power-up."""
 
     def power_cycle(self) -> None:
-        """Supply off and on: counters at 0."""
+        """Switch the supply off and on: counters at 0."""
         self._look()
         self._counted = [0.0, 0.0]
 
@@ -105,7 +106,7 @@ class RoboclawEmulator(FaultyDevice):
         end.write(answer)
 
     def _look(self) -> None:
-        """Count the wheels' rotation since the last call."""
+        """Count the rotation of the wheels since the last call."""
         now = self._source.wheels(self._clock.now())
         before, self._angles = self._angles or now, now
         settings = self._settings
@@ -117,5 +118,5 @@ class RoboclawEmulator(FaultyDevice):
 
 
 def emulated(setup: EmulatorSetup) -> RoboclawEmulator:
-    """The encoders of a simulated robot's rear wheels."""
+    """Create the encoders of a simulated robot's rear wheels."""
     return RoboclawEmulator(setup.clock, setup.physics.wheels, setup.settings)

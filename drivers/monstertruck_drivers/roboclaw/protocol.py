@@ -1,8 +1,8 @@
 """Packet serial of the RoboClaw (Basicmicro, "RoboClaw Series User Manual", chapters "Packet Serial", "Encoders").
 
 A request is the unit's address, a command and its arguments. An answer is the data and a CRC of two bytes, high byte
-first, over the request's address and command and the data: CRC-16 with polynomial 0x1021 that begins at 0. A request
-that is cut for more than 10 ms is dropped.
+first, over the request's address and command and the data: CRC-16 with polynomial 0x1021, initial value 0. The unit
+drops a request that pauses for more than 10 ms.
 """
 
 import binascii
@@ -11,9 +11,9 @@ from enum import IntEnum
 from typing import Final
 
 NAME: Final = b"roboclaw"
-"""Part of the unit's version text, in any case."""
+"""Part of the unit's version text, case-insensitive."""
 ADDRESSES: Final = (0x80, 0x87)
-"""Lowest and highest."""
+"""Lowest and highest address."""
 LONGEST_NAME: Final = 48
 PACKET_GAP: Final = 0.01
 """Silence after which the unit drops a partial request (s)."""
@@ -24,7 +24,7 @@ COUNTS_SIZE: Final = _COUNTS.size + _CRC.size
 
 
 class RoboclawCommand(IntEnum):
-    """Requests that are used: they move and change nothing."""
+    """Requests used; none of them moves a motor or changes a setting."""
 
     VERSION = 21
     """Answer: a text that ends with a line feed and 0."""
@@ -33,28 +33,28 @@ class RoboclawCommand(IntEnum):
 
 
 def request(address: int, command: RoboclawCommand) -> bytes:
-    """Bytes of a request without arguments."""
+    """Encode a request without arguments."""
     return bytes((address, command))
 
 
 def signed(asked: bytes, data: bytes) -> bytes:
-    """An answer to a request: the data and their CRC."""
+    """Encode an answer to a request: the data and its CRC."""
     return data + _CRC.pack(binascii.crc_hqx(asked + data, 0))
 
 
 def is_intact(asked: bytes, answer: bytes) -> bool:
-    """Whether the CRC at the end of an answer to ``asked`` is right."""
+    """Whether the CRC at the end of an answer to ``asked`` is valid."""
     return len(answer) > _CRC.size and signed(asked, answer[: -_CRC.size]) == answer
 
 
 def counts(answer: bytes) -> tuple[int, int]:
-    """Counters 1 and 2, without a sign, of an intact answer to ``COUNTS``."""
+    """Decode counters 1 and 2, unsigned, from an intact answer to ``COUNTS``."""
     first, second = _COUNTS.unpack(answer[: _COUNTS.size])
     return first, second
 
 
 def counted(first: int, second: int) -> bytes:
-    """Data of an answer to ``COUNTS``."""
+    """Encode the data of an answer to ``COUNTS``."""
     return _COUNTS.pack(first % COUNTER, second % COUNTER)
 
 

@@ -38,7 +38,7 @@ class RoboclawSession:
         Raises:
             DeviceLostError: unplugged.
             DeviceTimeoutError: silence.
-            WrongDeviceError: something else answers.
+            WrongDeviceError: another device answers.
         """
         heard = b""
         for _ in range(3):
@@ -47,19 +47,19 @@ class RoboclawSession:
             asked = request(self._address, RoboclawCommand.VERSION)
             if is_intact(asked, answer) and NAME in answer.lower():
                 return answer.partition(b"\n")[0].decode("ascii", "backslashreplace")
-            # A host that died may have left half a request, which is dropped after a pause.
+            # A host that died may have left half a request, which the unit drops after a pause.
             await self._clock.sleep(2 * PACKET_GAP)
         if not heard:
             raise DeviceTimeoutError(f"{self._link.name}: silent; expected a RoboClaw at address {self._address}")
         raise WrongDeviceError(f"{self._link.name}: {heard.hex(' ')} is not the answer of a RoboClaw")
 
     async def counts(self) -> tuple[int, int]:
-        """Both counters.
+        """Read both counters.
 
         Raises:
             DeviceLostError: unplugged.
             DeviceTimeoutError: no answer in time.
-            ProtocolError: a damaged one.
+            ProtocolError: the answer is damaged.
         """
         asked = request(self._address, RoboclawCommand.COUNTS)
         self._link.discard()
@@ -92,7 +92,7 @@ async def identify(link: Link, clock: Clock, settings: RoboclawConfig) -> dict[s
         JSON-able: ``version``, ``counts`` of inputs 1 and 2.
 
     Raises:
-        DeviceError: as the driver's ``run``.
+        DeviceError: see the driver's ``run``.
     """
     session = RoboclawSession(link, clock, settings.address, settings.answer_timeout)
     return {"version": await session.identify(), "counts": list(await session.counts())}

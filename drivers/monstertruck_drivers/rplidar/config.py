@@ -14,22 +14,23 @@ class RplidarConfig(TurningHeadConfig):
 
     kind: Literal["rplidar"] = "rplidar"
     model: Literal["a1", "a2", "a3", "c1", "s1", "s2"] = "a1"
-    """Model expected: its baud rate and its emulator"""
+    """Expected model; determines the baud rate and the emulator"""
     serial_number: str | None = None
-    """Unit expected on this port (32 hexadecimal digits); null accepts any"""
+    """Serial number expected on this port (32 hexadecimal digits); null accepts any"""
     scan_mode: str = "typical"
-    """Name of a mode that the unit lists (Standard, Express, Boost, Sensitivity, DenseBoost), or typical: the one that
-    its maker recommends"""
+    """Name of a scan mode of the unit (Standard, Express, Boost, Sensitivity, DenseBoost), or typical: the mode that
+    the unit recommends
+    """
     motor_pwm: Annotated[int, Field(ge=0, le=1023)] = 660
-    """Duty cycle of the motor of an A2 or A3 on its adapter board, of 1023; 660 is the maker's default"""
+    """Motor duty cycle of an A2 or A3 on its adapter board (of 1023); 660 is the manufacturer's default"""
     answer_timeout: Annotated[float, Field(gt=0, le=5)] = 0.5
-    """Seconds for an answer"""
+    """Timeout of an answer (s)"""
     boot: Annotated[float, Field(gt=0, le=10)] = 2.0
-    """Seconds a unit needs after a reset until it answers"""
+    """Maximum time from a reset to the first answer (s)"""
 
     @property
     def own_baud(self) -> int:
-        """Bits per second of the model's serial line."""
+        """Baud rate of the model's serial line (bit/s)."""
         return MODELS[self.model].baud
 
     @property

@@ -38,7 +38,7 @@ class SampleDecoder:
 
     Args:
         mode: scan mode.
-        baud: baud rate of the line; None where it has none.
+        baud: baud rate of the line; None if it has none.
     """
 
     def __init__(self, mode: ScanMode, baud: int | None) -> None:
@@ -51,7 +51,7 @@ class SampleDecoder:
         self._odd: list[float] = []
 
     def feed(self, data: bytes, arrival: float) -> list[BeamSamples]:
-        """Samples of the records that became complete; ``arrival``: of the bytes, ns."""
+        """Return the samples of the completed records; ``arrival`` is the arrival time of the bytes (ns)."""
         records = self.parser.feed(data)
         if self._mode.answer is DataType.STANDARD:
             return [self._timed(decode_standard(record.data), arrival) for record in records]
@@ -64,17 +64,19 @@ class SampleDecoder:
         return found
 
     def _follows(self, record: Record, following: Record) -> bool:
-        """Whether no record was lost between the two."""
+        """Whether the records are consecutive."""
         assert record.start is not None
         assert following.start is not None
         span = float((following.start - record.start) % TURN_Q6)
-        agree = 0.25  # tolerated deviation of a record's span (share of the usual): else records were lost
+        agree = 0.25  # tolerance of a record's span (fraction of the usual one); beyond it, records were lost
         if self._usual is not None and abs(span - self._usual) <= agree * self._usual:
             self._usual += (span - self._usual) / 8
             self._odd.clear()
             return True
         self._odd.append(span)
-        if self._usual is None or len(self._odd) >= 5:  # spans in a row that disagree and make the usual one
+        if (
+            self._usual is None or len(self._odd) >= 5
+        ):  # number of consecutive deviating spans that redefine the usual one
             self._usual = float(np.median(self._odd))
             self._odd.clear()
         return False
@@ -89,14 +91,14 @@ class RplidarDriver(ScannerDriver[RplidarConfig]):
     """A RPLIDAR on a port."""
 
     async def run(self, ready: Ready) -> None:
-        """One session: identify, check its health, start motor and scan; both are off when it ends.
+        """Serve one session: identify the unit, check its health, run motor and scan; both are off at its end.
 
         Raises:
-            DeviceFaultError: the unit protects itself, also after a reset.
+            DeviceFaultError: the unit stays in its protection stop after a reset.
             DeviceLostError: nothing plugged in, or unplugged.
-            DeviceTimeoutError: silence, or a head that does not turn.
+            DeviceTimeoutError: silence, or a stationary head.
             PortBusyError: another process holds the port.
-            ProtocolError: answers against the protocol, or bytes without a sample.
+            ProtocolError: answers that violate the protocol, or bytes without a sample.
             WrongDeviceError: another device, or another unit than configured.
         """
         async with await self._port.open() as link:
@@ -132,7 +134,7 @@ class RplidarDriver(ScannerDriver[RplidarConfig]):
         config, clock, begin = self._config, self._clock, self._clock.now()
         decoder, cutter = SampleDecoder(mode, link.baud), TurnCutter()
         times = ArrivalTimes(mode.sample_time * SECOND)
-        wake_period = 0.01  # seconds of samples worth waking for
+        wake_period = 0.01  # duration of the samples that justify a wake-up (s)
         records = max(wake_period / mode.sample_time / COUNTS[mode.answer], 1.0)
         stream: DeviceStream[BeamSamples] = DeviceStream(
             link,

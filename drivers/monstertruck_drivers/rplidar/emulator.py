@@ -1,4 +1,4 @@
-"""The device side of the RPLIDARs, byte for byte: start-up, health, modes, a motor that comes up to speed, streams."""
+"""Device side of the RPLIDARs, byte for byte: start-up, health, modes, spin-up of the motor, streams."""
 
 import asyncio
 import struct
@@ -38,25 +38,25 @@ from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
 
 GREETING: Final = b"RP LIDAR System.\r\nFirmware Ver 1.29 - rc7, HW Ver 7\r\nModel: 18\r\n"
-"""Startup message of an A1."""
+"""Start-up message of an A1."""
 RANGE: Final = "range"
-"""Distances of a record, mm."""
+"""Signal: distances of a record (mm)."""
 SCAN: Final = "scan"
 
 
 class RplidarEmulator(FaultyDevice):
     """RPLIDAR with its rotating head.
 
-    Faults (``inject``): ``silent on|off`` and ``deaf on|off``, ``health 0|1|2 CODE`` (2: protects itself until it is
-    reset), ``broken on|off`` (protects itself after a reset, too), ``bad_checksum N`` (the next N records),
-    ``torn`` (the next record begins in its middle), and the faults of the head.
+    Faults (``inject``): ``silent on|off`` and ``deaf on|off``, ``health 0|1|2 CODE`` (2: protection stop until a
+    reset), ``broken on|off`` (protection stop also after a reset), ``bad_checksum N`` (the next N records), ``torn``
+    (the next record begins in its middle), and the faults of the head.
 
     Args:
         clock: time.
         source: source of the ranges.
         model: model according to its data sheet.
         seed: seed of covers.
-        firmware: below 1.24 it does not list its modes.
+        firmware: version; below 1.24 the unit does not list its modes.
         serial: 32 hexadecimal digits.
     """
 
@@ -118,7 +118,7 @@ class RplidarEmulator(FaultyDevice):
                     self._answer(end, *taken)
 
     def power_cycle(self) -> None:
-        """Supply off and on: idle; a motor that the adapter board drives stands, any other turns."""
+        """Switch the supply off and on: idle; a motor driven by the adapter board stops, any other one turns."""
         self.head.stop()
         self._restart()
         self._motor_off = self._model.adapter
@@ -240,7 +240,7 @@ class RplidarEmulator(FaultyDevice):
                 self._greeting = False
                 end.write(GREETING)
             self.head.turn(np.array([self.head.now()], np.int64))
-            await self._clock.sleep(0.01)  # seconds between two looks at what to do
+            await self._clock.sleep(0.01)  # seconds between two checks for work
 
     async def _stream(self, end: DeviceEnd, mode: ScanMode) -> None:
         group = 8  # standard samples that are sent together
@@ -248,11 +248,11 @@ class RplidarEmulator(FaultyDevice):
         period, fresh = mode.sample_time * SECOND, True
         begin = float(self.head.now())
         while self.mode is mode:
-            ahead = mode.answer is DataType.ULTRA  # its last samples lean on the first one of the next record
+            ahead = mode.answer is DataType.ULTRA  # its last samples depend on the first sample of the next record
             times = (begin + period * np.arange(1, count + 1 + ahead)).astype(np.int64)
             last = int(times[-1])
             await self._clock.sleep_until(self.head.world_time(last))
-            overslept = SECOND // 2  # nanoseconds that it lags behind after the host's machine slept, at most
+            overslept = SECOND // 2  # maximum lag after the host's machine slept (ns)
             late = self.head.now() - last > overslept
             begin = float(self.head.now() if late else begin + period * count)
             if self.mode is not mode or late:
@@ -294,12 +294,12 @@ class RplidarEmulator(FaultyDevice):
 
 
 def _first_capsules(modes: tuple[ScanMode, ...]) -> ScanMode:
-    """Mode that an express request for mode 0 gets."""
+    """Return the mode for an express request of mode 0."""
     return next(mode for mode in modes if mode.answer is not DataType.STANDARD)
 
 
 def emulated(setup: EmulatorSetup) -> RplidarEmulator:
-    """The lidar of a simulated robot."""
+    """Create the lidar of a simulated robot."""
     settings = setup.settings if isinstance(setup.settings, RplidarConfig) else RplidarConfig()
     serial = settings.serial_number or "7DED9A87C5E392D3A5E49EF0ED383D65"
     return RplidarEmulator(setup.clock, setup.room, MODELS[settings.model], seed=setup.seed, serial=serial)

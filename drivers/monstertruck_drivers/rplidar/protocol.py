@@ -7,7 +7,7 @@ come in one of four forms:
 - standard (0x81): one sample in five bytes, checked by three bits only;
 - express (0x82): 32 samples in 84 bytes, each with an individual angle correction to subtract;
 - ultra (0x84): 96 samples in 132 bytes, one of three neighbours is absolute and two are differences; angles follow from
-  the distances, as in the maker's library;
+  the distances, as in the manufacturer's library;
 - dense (0x85): 40 samples in 84 bytes.
 
 The last three state their start angle; their samples are spread evenly up to the start of the next record. Angles
@@ -64,32 +64,32 @@ class DataType(IntEnum):
 
 
 class ConfigKey(IntEnum):
-    """What ``RplidarCommand.CONFIG`` asks for."""
+    """Properties that ``RplidarCommand.CONFIG`` requests."""
 
     MODE_COUNT = 0x70
     SAMPLE_TIME = 0x71
-    """Microseconds, in 1/256."""
+    """Sample time (1/256 us)."""
     LONGEST = 0x74
-    """Metres, in 1/256."""
+    """Maximum range (1/256 m)."""
     ANSWER_TYPE = 0x75
     TYPICAL_MODE = 0x7C
     NAME = 0x7F
 
 
 class ScanMode(NamedTuple):
-    """A way to scan."""
+    """Scan mode of a unit."""
 
     number: int
     name: str
     sample_time: float
-    """Seconds from sample to sample."""
+    """Time between samples (s)."""
     longest: float
-    """m."""
+    """Maximum range (m)."""
     answer: DataType
 
 
 class RplidarModel(NamedTuple):
-    """A model by its data sheet."""
+    """Data sheet of a model."""
 
     title: str
     number: int
@@ -98,11 +98,11 @@ class RplidarModel(NamedTuple):
     ranges: RangeSheet
     modes: tuple[ScanMode, ...]
     typical: int
-    """Index into ``modes``."""
+    """Index into ``modes`` of the recommended mode."""
     frequency: float
-    """Turns a second."""
+    """Rotation rate (Hz)."""
     adapter: bool = False
-    """Whether its motor is driven by the adapter board (``MOTOR_PWM``)."""
+    """Whether the adapter board drives the motor (``MOTOR_PWM``)."""
 
 
 def _modes(*rows: tuple[str, float, float, DataType]) -> tuple[ScanMode, ...]:
@@ -148,7 +148,7 @@ def _xor(data: bytes) -> int:
 
 
 def request(command: RplidarCommand, payload: bytes = b"") -> bytes:
-    """Bytes of a request."""
+    """Encode a request."""
     if command < 0x80:  # commands without a payload
         return bytes((SYNC, command))
     body = bytes((SYNC, command, len(payload))) + payload
@@ -156,12 +156,12 @@ def request(command: RplidarCommand, payload: bytes = b"") -> bytes:
 
 
 def express_request(mode: int) -> bytes:
-    """Request to scan in a mode other than the first."""
+    """Encode a request to scan in a mode other than the first."""
     return request(RplidarCommand.EXPRESS_SCAN, struct.pack("<BI", mode, 0))
 
 
 def config_request(key: ConfigKey, mode: int = 0) -> bytes:
-    """Request for a property of a mode, or of the unit."""
+    """Encode a request for a property of a mode, or of the unit."""
     own = key in (ConfigKey.MODE_COUNT, ConfigKey.TYPICAL_MODE)
     return request(RplidarCommand.CONFIG, struct.pack("<I", key) + (b"" if own else struct.pack("<H", mode)))
 
@@ -170,18 +170,18 @@ class Descriptor(NamedTuple):
     """Descriptor of the following answer."""
 
     length: int
-    """Bytes of one record."""
+    """Size of one record (bytes)."""
     repeated: bool
     type: int
 
 
 def build_descriptor(descriptor: Descriptor) -> bytes:
-    """Bytes of a descriptor."""
+    """Encode a descriptor."""
     return ANSWER + struct.pack("<IB", descriptor.length | descriptor.repeated << 30, descriptor.type)
 
 
 def parse_descriptor(data: bytes) -> Descriptor:
-    """Descriptor from its seven bytes."""
+    """Decode a descriptor from its seven bytes."""
     word, kind = struct.unpack("<IB", data[2:DESCRIPTOR])
     return Descriptor(word & 0x3FFFFFFF, bool(word >> 30), kind)
 
@@ -196,12 +196,12 @@ class RplidarIdentity(NamedTuple):
 
 
 def parse_info(data: bytes) -> RplidarIdentity:
-    """Identity from its 20 bytes."""
+    """Decode the identity from its 20 bytes."""
     return RplidarIdentity(data[0], (data[2], data[1]), data[3], data[4:20].hex().upper())
 
 
 def build_info(identity: RplidarIdentity) -> bytes:
-    """The opposite of ``parse_info``."""
+    """Inverse of ``parse_info``."""
     major, minor = identity.firmware
     return bytes((identity.model, minor, major, identity.hardware)) + bytes.fromhex(identity.serial)
 
@@ -210,7 +210,7 @@ class Health(NamedTuple):
     """Answer to HEALTH."""
 
     status: int
-    """0 good, 1 warning, 2 stopped to protect itself."""
+    """0 good, 1 warning, 2 protection stop."""
     code: int
 
 
@@ -218,24 +218,24 @@ class Health(NamedTuple):
 
 
 class Record(NamedTuple):
-    """Samples as they came in one record."""
+    """Samples of one record, still encoded."""
 
     start: int | None
     """Start angle of the samples (1/64 degrees); None if each sample has an angle."""
     fresh: bool
-    """Whether a stream begins with it."""
+    """Whether the record begins a stream."""
     data: bytes
 
 
 SIZES: Final = {DataType.STANDARD: 5, DataType.EXPRESS: 84, DataType.ULTRA: 132, DataType.DENSE: 84}
 COUNTS: Final = {DataType.STANDARD: 1, DataType.EXPRESS: 32, DataType.ULTRA: 96, DataType.DENSE: 40}
-"""Samples of a record."""
+"""Number of samples per record."""
 SURE: Final = 8
-"""Standard samples in a row that must be sound before they are believed after damage."""
+"""Number of consecutive valid standard samples required after damage."""
 
 
 class RecordParser:
-    """Collects bytes to records of one type; counts the bytes that belong to none.
+    """Extracts records of one type from bytes; counts the bytes outside of records.
 
     Args:
         kind: kind of the samples.
@@ -248,7 +248,7 @@ class RecordParser:
         self._sound = True
 
     def feed(self, data: bytes) -> list[Record]:
-        """Records that became complete."""
+        """Return the completed records."""
         self._buffer += data
         return self._standard() if self._kind is DataType.STANDARD else self._capsules()
 
@@ -268,7 +268,7 @@ class RecordParser:
         return records
 
     def _standard(self) -> list[Record]:
-        """Sound samples; after damage as many as ``SURE`` in a row are needed to find the beginning of one again."""
+        """Return valid samples; after damage ``SURE`` consecutive valid ones are needed to resynchronise."""
         buffer, records = self._buffer, []
         while len(buffer) >= self._size * (1 if self._sound else SURE):
             whole = len(buffer) // self._size
@@ -291,15 +291,15 @@ class Decoded(NamedTuple):
     """Samples of a record."""
 
     turns: Array
-    """Angles, (n,), turns."""
+    """Angles, shape (n,) (turns)."""
     ranges: Array
-    """(n,) (m); 0 = no return."""
+    """Ranges, shape (n,) (m); 0 = no return."""
     qualities: NDArray[np.uint8]
-    """(n,)."""
+    """Qualities, shape (n,)."""
 
 
 def decode_standard(data: bytes) -> Decoded:
-    """Samples of five bytes each."""
+    """Decode samples of five bytes each."""
     rows = np.frombuffer(data, np.uint8).reshape(-1, 5)
     angle = (rows[:, 1].astype(np.float64) // 2 + rows[:, 2] * 128.0) / TURN_Q6
     millimetres = (rows[:, 3] + rows[:, 4] * 256.0) / 4.0
@@ -307,11 +307,11 @@ def decode_standard(data: bytes) -> Decoded:
 
 
 NO_QUALITY: Final = 47
-"""Quality stated for every return of the forms that carry none, as the maker's library does."""
+"""Quality reported for every return of the forms without a quality, as in the manufacturer's library."""
 
 
 def decode_capsule(kind: DataType, record: Record, following: Record) -> Decoded:
-    """Samples of a record, spread up to the beginning of the following one."""
+    """Decode a record; its samples are spread up to the start of the following record."""
     assert record.start is not None
     assert following.start is not None
     count = COUNTS[kind]
@@ -329,7 +329,7 @@ def decode_capsule(kind: DataType, record: Record, following: Record) -> Decoded
 
 
 def _express(data: bytes) -> tuple[Array, Array]:
-    """Distances, mm, and angles to be subtracted, turns, each (32,)."""
+    """Decode distances (mm) and angles to subtract (turns), each of shape (32,)."""
     rows = np.frombuffer(data, np.uint8).reshape(16, 5).astype(np.int64)
     first, second = rows[:, 0] | rows[:, 1] << 8, rows[:, 2] | rows[:, 3] << 8
     distances = np.stack((first >> 2, second >> 2), axis=1).ravel()
@@ -338,7 +338,10 @@ def _express(data: bytes) -> tuple[Array, Array]:
 
 
 def build_express(millimetres: NDArray[np.int64], offsets: NDArray[np.int64]) -> bytes:
-    """Body of an express record: distances below 16384 mm and angles to be subtracted, 1/8 degrees, each (32,)."""
+    """Encode the body of an express record: distances (mm, below 16384) and angles to subtract (1/8 degrees).
+
+    Both have shape (32,).
+    """
     words = millimetres << 2 | offsets >> 4
     rows = np.empty((16, 5), np.uint8)
     rows[:, 0], rows[:, 1] = words[::2] & 0xFF, words[::2] >> 8
@@ -348,11 +351,11 @@ def build_express(millimetres: NDArray[np.int64], offsets: NDArray[np.int64]) ->
 
 
 _LEVELS: Final = ((3328, 1 << 14, 4), (1792, 1 << 12, 3), (1280, 1 << 11, 2), (512, 1 << 9, 1), (0, 0, 0))
-"""Ultra: least code, its distance, mm, and how many bits of the distance its steps leave out."""
+"""Levels of the ultra encoding: minimum code, its distance (mm), and the number of bits omitted from the distance."""
 
 
 def ultra_decode(codes: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Distances, mm, of 12-bit codes, and the bits that each leaves out."""
+    """Decode the distances (mm) of 12-bit codes, and the number of bits that each code omits."""
     distances, levels = np.zeros_like(codes), np.zeros_like(codes)
     for least, base, level in reversed(_LEVELS):
         there = codes >= least
@@ -362,7 +365,7 @@ def ultra_decode(codes: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[n
 
 
 def ultra_encode(millimetres: NDArray[np.int64]) -> NDArray[np.int64]:
-    """12-bit codes of distances, mm."""
+    """Encode distances (mm) as 12-bit codes."""
     codes = np.zeros_like(millimetres)
     for least, base, level in reversed(_LEVELS):
         there = millimetres >= base
@@ -375,7 +378,7 @@ _INVALID: Final = (-512, 511)
 
 
 def ultra_distances(data: bytes, following: bytes) -> Array:
-    """Distances of an ultra record, (96,), mm; 0 = no return. The last ones lean on the record that follows."""
+    """Distances of an ultra record (mm), shape (96,); 0 = no return. The last ones depend on the following record."""
     words = np.frombuffer(data, "<u4").astype(np.int64)
     after = np.frombuffer(following, "<u4", 1).astype(np.int64)
     major, level = ultra_decode(np.append(words, after) & 0xFFF)
@@ -389,7 +392,7 @@ def ultra_distances(data: bytes, following: bytes) -> Array:
 
 
 def build_ultra(millimetres: NDArray[np.int64]) -> bytes:
-    """Body of an ultra record from its distances and the first one after it, (97,), mm; 0 = no return."""
+    """Encode the body of an ultra record from its distances and the first following one, (97,), mm; 0 = no return."""
     codes = ultra_encode(millimetres[::3])
     major, level = ultra_decode(codes)
     base, base_level = major[:-1], level[:-1]
@@ -410,7 +413,7 @@ def _signed(ten_bits: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def ultra_offset(millimetres: Array) -> Array:
-    """Angle to subtract at distances (n,) (turns), as the triangulating sensor is offset from its axis."""
+    """Angle to subtract (turns) at distances (n,), because the triangulating sensor is offset from its axis."""
     quarter = np.maximum(millimetres * 4.0, 1.0)
     part = np.floor(98361.0 / quarter)
     near = math.radians(8.0) * 65536.0 - part * 64.0 - part**3 / 98304.0
@@ -419,7 +422,7 @@ def ultra_offset(millimetres: Array) -> Array:
 
 
 def build_capsule(start: int, body: bytes, *, fresh: bool) -> bytes:
-    """Bytes of an express, ultra or dense record that begins at ``start``, 1/64 degrees."""
+    """Encode an express, ultra or dense record that starts at angle ``start`` (1/64 degrees)."""
     tail = struct.pack("<H", start % TURN_Q6 | fresh << 15) + body
     total = _xor(tail)
     return bytes((0xA0 | total & 0xF, 0x50 | total >> 4)) + tail
@@ -428,7 +431,7 @@ def build_capsule(start: int, body: bytes, *, fresh: bool) -> bytes:
 def build_standard(
     turns: Array, millimetres: NDArray[np.int64], qualities: NDArray[np.int64], starts: NDArray[np.bool_]
 ) -> bytes:
-    """Bytes of standard samples: angles (turns), distances (mm), qualities below 64, which begin a turn; each (n,)."""
+    """Encode standard samples: angles (turns), distances (mm), qualities below 64, and starts of a turn; each (n,)."""
     angle = np.rint(turns * TURN_Q6).astype(np.int64) % TURN_Q6
     distance = np.minimum(millimetres * 4, 0xFFFF)
     rows = np.empty((len(turns), 5), np.uint8)

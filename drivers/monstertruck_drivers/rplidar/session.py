@@ -1,4 +1,4 @@
-"""Asking a RPLIDAR: one request at a time, from any state it may have been left in."""
+"""Requests to an RPLIDAR, one at a time, from any state it may have been left in."""
 
 import struct
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ from monstertruck_runtime.errors import (
 )
 
 QUIET: Final = 0.1
-"""Seconds of silence that prove that a stream has ended; it ends within 1 ms of STOP (maker's protocol)."""
+"""Silence that proves that a stream has ended (s); it ends within 1 ms of STOP (manufacturer's protocol)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,9 +42,9 @@ class ScannerUnit:
     health: Health
     modes: tuple[ScanMode, ...]
     typical: int
-    """Number of the mode that the maker recommends."""
+    """Index of the recommended mode."""
     pwm: bool
-    """Whether its motor obeys ``MOTOR_PWM``."""
+    """Whether ``MOTOR_PWM`` controls the motor."""
 
 
 class RplidarSession:
@@ -53,7 +53,7 @@ class RplidarSession:
     Args:
         link: open link.
         clock: time.
-        config: patience.
+        config: timeouts.
     """
 
     def __init__(self, link: Link, clock: Clock, config: RplidarConfig) -> None:
@@ -61,12 +61,12 @@ class RplidarSession:
         self._heard = 0
 
     async def handshake(self) -> ScannerUnit:
-        """Bring the unit to rest and learn who it is; one that protects itself is reset once.
+        """Stop the unit and identify it; a unit in protection stop is reset once.
 
         Raises:
-            DeviceFaultError: it still protects itself.
+            DeviceFaultError: it remains in protection stop.
             DeviceTimeoutError: silence.
-            ProtocolError: answers against the protocol.
+            ProtocolError: answers that violate the protocol.
             WrongDeviceError: another device, or another unit than configured.
         """
         await self.stop()
@@ -75,7 +75,7 @@ class RplidarSession:
         if wanted is not None and identity.serial != wanted.upper():
             raise WrongDeviceError(f"{self._link.name}: expected unit {wanted}, found {identity.serial}")
         health = await self._health()
-        protected = 2  # health of a unit that has stopped to protect itself
+        protected = 2  # health of a unit in protection stop
         if health.status == protected:
             await self.reset()
             health = await self._health()
@@ -91,7 +91,7 @@ class RplidarSession:
 
         Raises:
             DeviceTimeoutError: no answer.
-            ProtocolError: it sends another form than the mode has.
+            ProtocolError: it sends data of a type other than the mode's.
         """
         standard = mode.answer is DataType.STANDARD
         self._link.write(request(RplidarCommand.SCAN) if standard else express_request(mode.number))
@@ -116,7 +116,7 @@ class RplidarSession:
         raise WrongDeviceError(f"{self._link.name}: continues to send after STOP: not an RPLIDAR, or another baud rate")
 
     async def reset(self) -> None:
-        """Restart it, and wait until it answers again."""
+        """Restart the unit and wait for its answer."""
         self._link.write(request(RplidarCommand.RESET))
         until = self._clock.now() + round(self._config.boot * SECOND)
         while self._clock.now() < until:
@@ -128,7 +128,7 @@ class RplidarSession:
             return
 
     def turn_motor(self, pwm: int) -> None:
-        """Set the duty cycle of the motor, of 1023; 0 = off."""
+        """Set the duty cycle of the motor (of 1023); 0 = off."""
         self._link.write(request(RplidarCommand.MOTOR_PWM, struct.pack("<H", pwm)))
 
     def end(self) -> None:
@@ -169,7 +169,7 @@ class RplidarSession:
         return tuple(modes), typical
 
     async def _early_modes(self) -> tuple[tuple[ScanMode, ...], int]:
-        """Modes of firmware that does not list them."""
+        """Return the modes of firmware that does not list them."""
         standard, express = struct.unpack(
             "<HH", await self._ask(request(RplidarCommand.SAMPLE_RATE), DataType.SAMPLE_RATE)
         )
@@ -200,7 +200,7 @@ class RplidarSession:
         return await self._exactly(found.length, kind.name)
 
     async def _descriptor(self, what: str) -> bytes:
-        """The next descriptor; text of a unit that starts and remains of a stream before it are passed over."""
+        """Receive the next descriptor; skip the start-up text and remains of a stream before it."""
         head = await self._exactly(DESCRIPTOR, what)
         passed = 0
         while not head.startswith(ANSWER):
@@ -227,7 +227,7 @@ async def identify(link: Link, clock: Clock, settings: RplidarConfig) -> dict[st
         per second), ``typical``.
 
     Raises:
-        DeviceError: as the driver's ``run``.
+        DeviceError: see the driver's ``run``.
     """
     unit = await RplidarSession(link, clock, settings).handshake()
     return {

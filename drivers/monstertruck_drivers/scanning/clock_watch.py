@@ -1,4 +1,4 @@
-"""Watch of a mapped scanner clock: reports restarts and slews, and ends a session whose scans stay late."""
+"""Clock watch of a scanner: reports restarts and slews, and ends a session whose scans stay late."""
 
 from monstertruck_drivers.scanning.clock_map import ClockMap
 from monstertruck_runtime.clock import SECOND

@@ -10,19 +10,19 @@ from monstertruck_schemas.body import HalfTurn
 
 
 def sheet(settings: Any) -> RangeSheet:
-    """Return a scanner's ranges by its data sheet: the attribute ``sheet`` of its settings."""
-    # Ranges of a scanner whose settings state none, as for a URG-04LX.
+    """Return the range limits of a scanner: the attribute ``sheet`` of its settings."""
+    # Default for scanners whose settings have none: the URG-04LX.
     stated: RangeSheet = getattr(settings, "sheet", RangeSheet(0.02, 4.0, 0.01, 0.01))
     return stated
 
 
 class ScannerConfig(Schema):
-    """Settings that all scanners share."""
+    """Settings shared by all scanners."""
 
     frame: FrameId | None = None
-    """Frame of the published scans; null: named like the role"""
+    """Frame of the published scans; null: the name of the role"""
     hidden: Annotated[tuple[tuple[HalfTurn, HalfTurn], ...], Field(strict=False)] = ()
-    """Sectors hidden by parts of the robot such as a mast: first and last bearing counter-clockwise in the published
+    """Sectors hidden by parts of the robot, such as a mast: first and last bearing counter-clockwise in the published
     scans (rad); they are outside the field of view"""
 
 

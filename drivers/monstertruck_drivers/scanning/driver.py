@@ -16,10 +16,10 @@ class ScannerDriver(Generic[C]):
 
     Args:
         config: settings.
-        port: where it is plugged in.
+        port: port of the scanner.
         clock: time.
-        out: where scans go.
-        events: where readiness, faults and changes of its clock are reported.
+        out: publisher of the scans.
+        events: faults and changes of the scanner's clock.
         name: name of the service.
     """
 

@@ -1,4 +1,4 @@
-"""How a lidar is mounted on its robot: upside down, or behind parts that hide sectors.
+"""Mounting of a lidar on its robot: upside down, or behind parts that hide sectors.
 
 A beam at the bearing b of a lidar turned by pi about its x axis points where the beam at -b of an upright one does.
 """
@@ -19,18 +19,18 @@ def hangs(mount: Mount) -> bool:
 
 
 def upright(mount: Mount) -> Mount:
-    """Return the mount of the upright lidar that measures the same."""
+    """Return the mount of an upright lidar with the same measurements."""
     return mount.model_copy(update={"roll": math.remainder(mount.roll - math.pi, math.tau)}) if hangs(mount) else mount
 
 
 def turned_by_roll(mount: Mount) -> Mount:
-    """Return the same orientation with the roll, pitch and yaw of the other solution: roll and yaw half a turn on."""
+    """Return the same orientation by the other Euler-angle solution, with roll and yaw changed by half a turn."""
     half_turn = {name: math.remainder(getattr(mount, name) + math.pi, math.tau) for name in ("roll", "yaw")}
     return mount.model_copy(update={**half_turn, "pitch": math.remainder(math.pi - mount.pitch, math.tau)})
 
 
 class MountedScans:
-    """Publisher of the scans of a lidar as of an upright one, without what hidden beams measured.
+    """Publisher that converts the scans of a lidar to those of an upright one and masks hidden beams.
 
     Args:
         out: publisher of the scans.

@@ -1,4 +1,4 @@
-"""Publication of a turning head's revolutions as scans."""
+"""Publishes the revolutions of a turning head as scans."""
 
 import math
 
@@ -31,7 +31,7 @@ def publish(
         sheet: ranges and noise of the scanner.
         config: settings of the scanner.
         out: publisher of the scans.
-        name: name of its service, which names the frame where the settings do not.
+        name: name of the service; the default of the frame.
     """
     start = math.pi - math.tau * turn.first
     count = len(turn.ranges)

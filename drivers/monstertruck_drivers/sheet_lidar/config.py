@@ -12,16 +12,16 @@ from monstertruck_schemas.base import Positive
 
 
 class SheetLidarConfig(ReturnsConfig):
-    """Laser scanner of any maker, as its data sheet describes it: the simulated one before its driver exists.
+    """Laser scanner of any manufacturer, described by its data sheet, for simulation before its driver exists.
 
-    On a robot it is whatever sends the frames of ``sheet_lidar/protocol.py``, such as a microcontroller.
+    On a robot it is any device that sends the frames of ``sheet_lidar/protocol.py``, such as a microcontroller.
     """
 
     kind: Literal["sheet_lidar"] = "sheet_lidar"
     beams: Annotated[int, Field(ge=8, le=MOST_BEAMS)] = 450
-    """Beams of a scan"""
+    """Beams per scan"""
     field_of_view: Annotated[float, Field(gt=0, le=math.tau)] = math.tau
-    """Angle that a scan covers, its middle straight ahead (rad)"""
+    """Angle that a scan covers, centred straight ahead (rad)"""
     direction: Literal["clockwise", "counter_clockwise"] = "clockwise"
     """Turning direction seen from above"""
     rate: Annotated[float, Field(ge=2, le=100)] = 10.0
@@ -35,7 +35,7 @@ class SheetLidarConfig(ReturnsConfig):
     error: Annotated[float, Field(ge=0, lt=1)] = 0.03
     """Error bound of a range (m)"""
     relative_error: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """Error bound as a fraction of the range, where that is larger"""
+    """Error bound as a fraction of the range; the larger bound applies"""
     first_scan: Annotated[float, Field(gt=0, le=60)] = 6.0
     """Maximum time for the first scan, including the motor's start (s)"""
     stale: Annotated[float, Field(gt=0, le=10)] = 1.0

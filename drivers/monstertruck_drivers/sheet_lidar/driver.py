@@ -1,4 +1,4 @@
-"""Driver of a laser scanner described by its data sheet: listens, and publishes every scan."""
+"""Driver of a laser scanner described by its data sheet: receives and publishes every scan."""
 
 import numpy as np
 
@@ -28,13 +28,13 @@ class SheetLidarDriver(ScannerDriver[SheetLidarConfig]):
             DeviceLostError: unplugged.
             DeviceTimeoutError: silence, or scans that arrive late for seconds.
             ProtocolError: bytes without a scan.
-            WrongDeviceError: nothing that comes at the start is a scan of that many beams.
+            WrongDeviceError: the bytes at the start contain no scan with that number of beams.
             PortBusyError: another process holds the port.
         """
         config = self._config
         async with await self._port.open() as link:
             stream = DeviceStream(link, self._clock, SheetParser(config.beams).feed)
-            transfer = 0.001  # seconds assumed from the last beam to the arrival of the frame
+            transfer = 0.001  # assumed time from the last beam to the arrival of the frame (s)
             latency = config.time_increment * config.beams + transfer
             mapping = ClockMap(round(latency * SECOND), turn=STAMP_TURN)
             scans = await stream.first(config.first_scan, EXPECTED)
@@ -76,7 +76,7 @@ async def identify(link: Link, clock: Clock, settings: SheetLidarConfig) -> dict
         JSON-able: ``beams``, ``stamp_ms``, ``returns``.
 
     Raises:
-        DeviceError: as the driver's ``run``.
+        DeviceError: see the driver's ``run``.
     """
     stream = DeviceStream(link, clock, SheetParser(settings.beams).feed)
     scan = (await stream.first(settings.first_scan, EXPECTED))[-1]

@@ -1,4 +1,4 @@
-"""The device side of a laser scanner described by its data sheet."""
+"""Device side of a laser scanner described by its data sheet."""
 
 import asyncio
 import math
@@ -16,13 +16,13 @@ from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
 
 RANGE: Final = "range"
-"""Distances of a scan, mm."""
+"""Signal: distances of a scan (mm)."""
 COUNTER: Final = "counter"
-"""Time stamp (ms)."""
+"""Signal: time stamp (ms)."""
 
 
 class SheetLidarEmulator(FaultyDevice):
-    """Scanner that streams from power-up on.
+    """Scanner that streams from power-up.
 
     Faults (``inject``): ``silent on|off``, ``bad_crc N`` (the next N scans), and the faults of the head.
 
@@ -38,7 +38,7 @@ class SheetLidarEmulator(FaultyDevice):
     ) -> None:
         self.name = "lidar"
         self.received = ReceivedBytes()
-        """Bytes the host sent, for tests: it takes no notice of any."""
+        """Bytes the host sent, for tests; the scanner ignores them."""
         self._config = config or SheetLidarConfig()
         rng = np.random.default_rng(seed)
         kinds = {RANGE: SignalKind.ARRAY, COUNTER: SignalKind.NUMBER}
@@ -61,7 +61,7 @@ class SheetLidarEmulator(FaultyDevice):
                 self.received.extend(await end.read())
 
     def power_cycle(self) -> None:
-        """Supply off and on: its clock starts at 0, its head stands."""
+        """Switch the supply off and on: the clock starts at 0, the head is stationary."""
         self.head.stop()
         self._powered_at = self.head.now()
 
@@ -72,7 +72,7 @@ class SheetLidarEmulator(FaultyDevice):
             each = period * abs(self._config.increment) / math.tau
             times = (begin + each * np.arange(self._config.beams)).astype(np.int64)
             await self._clock.sleep_until(self.head.world_time(int(times[-1])))
-            # Nanoseconds that it lags behind after the host's machine slept, at most; older scans are lost.
+            # Maximum lag after the host's machine slept (ns); older scans are lost.
             overslept = 5 * SECOND // 10
             late = self.head.now() - int(times[-1]) > overslept
             begin = float(self.head.now() if late else begin + period)
@@ -92,5 +92,5 @@ class SheetLidarEmulator(FaultyDevice):
 
 
 def emulated(setup: EmulatorSetup) -> SheetLidarEmulator:
-    """The scanner of a simulated robot."""
+    """Create the scanner of a simulated robot."""
     return SheetLidarEmulator(setup.clock, setup.room, setup.settings, seed=setup.seed)

@@ -1,8 +1,8 @@
 """Frames of a laser scanner described by its data sheet (protocol of this project).
 
 A frame is one scan, numbers with the low byte first: "SL", number of beams (2 bytes), milliseconds of the scanner's
-clock at the first beam (3 bytes, starts again at 0), a range of 2 bytes for each beam (mm; 0 = no return), and the
-CRC-16 (CCITT, from 0) of all bytes before it. The scanner sends by itself and takes no commands.
+clock at the first beam (3 bytes, wraps), a range of 2 bytes for each beam (mm; 0 = no return), and the
+CRC-16 (CCITT, from 0) of all bytes before it. The scanner streams without a request and accepts no commands.
 """
 
 import binascii
@@ -26,7 +26,7 @@ class SheetScan(NamedTuple):
     stamp: int
     """Scanner's clock at the first beam (ms)."""
     ranges: NDArray[np.uint16]
-    """Shape (n,), mm; 0 = no return."""
+    """Ranges, shape (n,) (mm); 0 = no return."""
 
 
 def build(scan: SheetScan) -> bytes:
@@ -37,10 +37,10 @@ def build(scan: SheetScan) -> bytes:
 
 
 class SheetParser:
-    """Collects bytes to scans; counts the bytes that belong to none.
+    """Extracts scans from bytes; counts the bytes outside of scans.
 
     Args:
-        beams: beams of a scan; frames with another number are refused.
+        beams: beams per scan; frames with another number are rejected.
     """
 
     def __init__(self, beams: int) -> None:
@@ -50,7 +50,7 @@ class SheetParser:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> list[SheetScan]:
-        """Return the scans that became complete."""
+        """Return the completed scans."""
         self._buffer += data
         buffer, at, scans = self._buffer, 0, []
         while (found := buffer.find(self._begin, at)) >= 0 and len(buffer) - found >= self._size:

@@ -14,7 +14,7 @@ class SonarConfig(Schema):
     """One sonar."""
 
     address: Annotated[int, Field(ge=0xE0, le=0xFE)]
-    """I2C address in the maker's notation: even, 224 to 254"""
+    """I2C address in the manufacturer's notation: even, 224 to 254"""
     mount: Mount
     """Place and axis in the base frame"""
 
@@ -26,7 +26,7 @@ class SonarConfig(Schema):
 
 
 def five_sonars() -> dict[str, SonarConfig]:
-    """Left, front left, front, front right, right, as on the wall follower."""
+    """Left, front left, front, front right and right sonar, as on the wall follower."""
     places = {
         "l": (0.05, 0.05, pi / 2),
         "fl": (0.10, 0.05, pi / 4),
@@ -43,8 +43,8 @@ def five_sonars() -> dict[str, SonarConfig]:
 class Srf08Config(Schema):
     """Devantech SRF08 sonars on the I2C bus of a USB-ISS.
 
-    All sonars of a group fire together, one group after the other at equal times: sonars whose cones meet belong into
-    different groups.
+    All sonars of a group fire together, and the groups fire in turn at equal intervals. Sonars with overlapping cones
+    belong in different groups.
     """
 
     kind: Literal["srf08"] = "srf08"
@@ -53,23 +53,25 @@ class Srf08Config(Schema):
     groups: Annotated[tuple[tuple[str, ...], ...], Field(strict=False)] = (("l", "f", "r"), ("fl", "fr"))
     """Names of the sonars in firing order"""
     rate: Annotated[float, Field(gt=0, le=20)] = 10.0
-    """Messages a second; each has a ping of every sonar"""
+    """Message rate (Hz); each message contains a ping of every sonar"""
     range_min: Annotated[float, Field(gt=0, lt=6)] = 0.15
-    """m."""
+    """Minimum range (m)."""
     range_max: Annotated[float, Field(gt=0, le=6)] = 3.0
-    """m."""
+    """Maximum range (m)."""
     field_of_view: Annotated[float, Field(gt=0, le=3.1416)] = 0.87
     """Full opening angle of the cones (rad)"""
     gain: Annotated[int, Field(ge=0, le=31)] = 16
     """Maximum gain; a higher gain detects weaker echoes, but also echoes of the previous ping"""
     speed_of_sound: Annotated[float, Field(gt=300, lt=380)] = 343.0
-    """m/s; 0.6 more for each degree Celsius"""
+    """Speed of sound (m/s); it rises by 0.6 per degree Celsius"""
     timeout: Annotated[float, Field(gt=0, le=1)] = 0.05
     """Timeout of the USB-ISS's answer (s)"""
     silence: Annotated[float, Field(gt=0, le=10)] = 1.0
-    """Seconds without an answer of any sonar that end the session"""
+    """Time without an answer from any sonar after which the session ends (s)"""
     stuck_after: Annotated[int, Field(ge=2, le=10_000)] = 20
-    """Consecutive echoes equal to the microsecond after which a sonar is reported as not answering"""
+    """Number of consecutive echoes that are equal to the microsecond after which a sonar is reported as not
+    answering
+    """
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

@@ -1,4 +1,4 @@
-"""Driver of SRF08 sonars: groups fire in turn, and every round becomes one message."""
+"""Driver of SRF08 sonars: groups fire in turn, and every round yields one message."""
 
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.srf08 import protocol
@@ -13,11 +13,11 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import SonarEcho, SonarRanges
 
 LATER = 0.004
-"""Seconds from the end of ranging to the question, and to one more."""
+"""Time from the end of ranging to the first request, and between two requests (s)."""
 
 
 class Srf08Driver:
-    """Sets gain and range, which modules lose with their supply, fires and reads.
+    """Fires and reads the sonars, and sets their gain and range, which they lose with their supply.
 
     A sonar that does not answer, or repeats its answer to the microsecond, is reported as not answering; the others
     continue.
@@ -48,7 +48,7 @@ class Srf08Driver:
         self._events = events
         self._setting = protocol.range_setting(config.range_max)
         self._set_up: set[str] = set()
-        """Sonars that have their gain and range."""
+        """Sonars whose gain and range are set."""
         self._silent: set[str] = set()
         """Sonars whose loss was reported."""
         self._equal: dict[str, tuple[int, int]] = {}
@@ -59,7 +59,7 @@ class Srf08Driver:
 
         Raises:
             DeviceLostError: unplugged.
-            DeviceTimeoutError: silence of the USB-ISS, or of all sonars.
+            DeviceTimeoutError: no answer from the USB-ISS or from any sonar.
             ProtocolError: answers out of step.
             WrongDeviceError: another device.
             PortBusyError: another process holds the port.
@@ -87,7 +87,7 @@ class Srf08Driver:
                 self._publish(echoes)
 
     async def _ping(self, session: Srf08Session, group: tuple[str, ...]) -> dict[str, SonarEcho]:
-        """Fire a group, wait for its sound, and ask what came back."""
+        """Fire a group, wait for its echoes, and read them."""
         fired: dict[str, int | None] = {}
         for name in group:
             fired[name] = await self._fire(session, name)
@@ -96,7 +96,7 @@ class Srf08Driver:
         return {name: await self._echo(session, name, at, sent) for name, at in fired.items()}
 
     async def _fire(self, session: Srf08Session, name: str) -> int | None:
-        """Time of the ping; None: the sonar does not take the command."""
+        """Fire a sonar and return the time of the ping; None if the sonar does not accept the command."""
         address = self._config.sonars[name].address
         if name not in self._set_up:
             for register, value in ((Srf08Register.GAIN, self._config.gain), (Srf08Register.RANGE, self._setting)):

@@ -1,4 +1,4 @@
-"""The device side of SRF08 sonars behind a USB-ISS, byte for byte."""
+"""Device side of SRF08 sonars behind a USB-ISS, byte for byte."""
 
 from dataclasses import dataclass
 from math import inf
@@ -30,7 +30,7 @@ SOUND: Final = 343.0
 
 @dataclass(slots=True)
 class Module:
-    """One sonar. Its gain and range are lost with the supply."""
+    """One sonar; it loses its gain and range with the supply."""
 
     name: str
     gain: int = 31
@@ -204,5 +204,5 @@ def _size(buffer: bytes) -> int | None:
 
 
 def emulated(setup: EmulatorSetup) -> Srf08Emulator:
-    """The sonars of a simulated robot."""
+    """Create the sonars of a simulated robot."""
     return Srf08Emulator(setup.clock, setup.physics.sonars, setup.settings, seed=setup.seed)

@@ -11,27 +11,27 @@ from typing import Final, NamedTuple
 
 ISS: Final = 0x5A
 VERSION: Final = bytes((ISS, 0x01))
-"""Answered by module number, firmware and mode."""
+"""Version request; the answer is module number, firmware and mode."""
 MODULE: Final = 0x07
 I2C_100KHZ: Final = 0x60
 """I2C mode of the hardware controller."""
 IO_INPUTS: Final = 0xAA
 SET_MODE: Final = bytes((ISS, 0x02, I2C_100KHZ, IO_INPUTS))
-"""Answered by 0xFF 0x00, or 0x00 and a reason."""
+"""Mode request; the answer is 0xFF 0x00, or 0x00 and a reason."""
 I2C_AD1: Final = 0x55
 ACK: Final = 0xFF
 
 ADDRESSES: Final = tuple(range(0xE0, 0x100, 2))
-"""Addresses that a module may be set to; with the lowest bit set they are for reading."""
+"""Possible addresses of a module; the lowest bit is set for reading."""
 RANGE_IN_MICROSECONDS: Final = 0x52
 ABSENT: Final = 0xFF
-"""Software revision read when no module drives the bus."""
+"""Software revision read if no module drives the bus."""
 RANGE_STEP: Final = 0.043
-"""Metres of the range register's unit, by the maker's speed of sound."""
+"""Unit of the range register (m), at the manufacturer's speed of sound."""
 
 
 class Srf08Register(IntEnum):
-    """For writing; reading gives revision, light, and the first echo's high and low byte."""
+    """Registers for writing; reading returns revision, light, and the first echo's high and low byte."""
 
     COMMAND = 0
     GAIN = 1
@@ -39,7 +39,7 @@ class Srf08Register(IntEnum):
 
 
 class Srf08Reading(NamedTuple):
-    """Registers 0 to 3."""
+    """Content of registers 0 to 3."""
 
     revision: int
     light: int
@@ -56,20 +56,20 @@ READ_SIZE: Final = 4
 
 
 def write(address: int, register: int, value: int) -> bytes:
-    """Set a register; answered by one byte, 0 where no module took it."""
+    """Return a command that sets a register; the answer is one byte, 0 if no module acknowledged."""
     return bytes((I2C_AD1, address, register, 1, value))
 
 
 def read(address: int) -> bytes:
-    """Ask for revision, light and the first echo; answered by ``READ_SIZE`` bytes."""
+    """Return a request for revision, light and the first echo; the answer has ``READ_SIZE`` bytes."""
     return bytes((I2C_AD1, address | 1, 0, READ_SIZE))
 
 
 def parse_reading(data: bytes) -> Srf08Reading:
-    """What ``read`` was answered.
+    """Parse the answer to ``read``.
 
     Raises:
-        ValueError: of another length.
+        ValueError: wrong length.
     """
     if len(data) != READ_SIZE:
         raise ValueError(f"expected {READ_SIZE} bytes, got {len(data)}")
@@ -77,10 +77,10 @@ def parse_reading(data: bytes) -> Srf08Reading:
 
 
 def range_setting(metres: float) -> int:
-    """Range register value for echoes from up to ``metres``."""
+    """Return the range register value for echoes from up to ``metres``."""
     return max(0, min(255, ceil(metres / RANGE_STEP) - 1))
 
 
 def ranging_time(setting: int) -> float:
-    """Seconds that a module ranges, and does not answer, by its range register: 65 ms from the factory."""
+    """Time for which a module ranges and does not answer (s), by its range register; 65 ms at the factory setting."""
     return (setting + 1) * 65e-3 / 256

@@ -1,4 +1,4 @@
-"""Requests and replies, with a USB-ISS and the sonars behind it; shared by the driver and `identify`."""
+"""Requests and replies of a USB-ISS and its sonars; shared by the driver and `identify`."""
 
 from monstertruck_drivers.link import Link
 from monstertruck_drivers.srf08 import protocol
@@ -25,7 +25,7 @@ class Srf08Session:
 
         Raises:
             DeviceLostError: unplugged.
-            DeviceTimeoutError: the answer did not come in time.
+            DeviceTimeoutError: no answer within the timeout.
             ProtocolError: unrequested bytes.
         """
         if count := self._link.discard():
@@ -37,7 +37,7 @@ class Srf08Session:
             raise DeviceTimeoutError(f"{self._link.name}: the USB-ISS does not answer") from None
 
     async def start(self) -> int:
-        """Make sure of a USB-ISS, and set it to I2C; returns its firmware's number.
+        """Identify the USB-ISS and set it to I2C mode; return its firmware version.
 
         Raises:
             DeviceLostError: unplugged.
@@ -66,22 +66,22 @@ class Srf08Session:
         return answer[1]
 
     async def set(self, address: int, register: int, value: int) -> bool:
-        """Write a register; False = no module took it."""
+        """Write a register; return False if no module acknowledged."""
         return (await self.ask(protocol.write(address, register, value), 1))[0] != 0
 
     async def read(self, address: int) -> Srf08Reading:
-        """Registers of a module."""
+        """Read the registers of a module."""
         return protocol.parse_reading(await self.ask(protocol.read(address), READ_SIZE))
 
 
 async def identify(link: Link, clock: Clock, settings: Srf08Config) -> dict[str, object]:
-    """Ask the USB-ISS for its version, and every address for its software revision.
+    """Read the version of the USB-ISS and the software revision at every address.
 
     Returns:
         JSON-able: ``firmware`` of the USB-ISS, ``sonars`` (address to software revision).
 
     Raises:
-        DeviceError: as the driver's ``run``.
+        DeviceError: see the driver's ``run``.
     """
     session = Srf08Session(link, settings.timeout)
     firmware = await session.start()

@@ -25,7 +25,7 @@ class StepperConfig(Schema):
     steps_per_turn: Annotated[int, Field(ge=4, le=51_200)] = 400
     """Steps per motor turn, including half or micro steps; must equal the controller's value"""
     inverted: Annotated[tuple[bool, ...], Field(strict=False)] = (False,) * MOTORS
-    """For each motor: driving forward takes negative rates"""
+    """For each motor: whether driving forward needs negative rates"""
     max_rate: Annotated[float, Field(gt=0, le=MAX_RATE / 1000)] = 250.0
     """Limit of requested rates (steps/s); choose it below the rate at which a motor loses steps"""
     acceleration: Annotated[int, Field(gt=0, le=1_000_000)] = 4000
@@ -62,7 +62,7 @@ class StepperConfig(Schema):
 
     @property
     def stop_words(self) -> str:
-        """Empty: the stop script needs the port alone."""
+        """Arguments of the stop script: none, because it needs only the port."""
         return ""
 
     @model_validator(mode="after")

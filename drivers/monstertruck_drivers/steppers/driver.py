@@ -1,9 +1,9 @@
 """Drive service of several shafts on one stepper controller: ``cmd/drive*`` in, ``sensor/drive*`` out.
 
-One exchange a cycle: the set-points of all shafts go out, the status comes back and is the feedback of every shaft.
+One exchange per cycle sends the set-points of all shafts and receives the status, which is the feedback of every shaft.
 
-The controller's watchdog stops the motors when the host is silent. The first request of every session is a quick stop,
-the last ones are quick stops until the motors rest, and coils off, whether they rest or not.
+The controller's watchdog stops the motors when the host is silent. Every session starts with a quick stop. It ends with
+quick stops until the motors rest, and then switches the coils off, even if the motors still turn.
 """
 
 import contextlib
@@ -31,7 +31,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import DriveFeedback, DriveMode
 
 SAFE_DEADLINE: Final = 0.4
-"""Seconds a session may take at its end to stop the motors and switch them off."""
+"""Maximum time for stopping the motors and switching them off at the end of a session (s)."""
 
 MODES: Final = {
     MotorState.OFF: DriveMode.DISABLED,
@@ -46,7 +46,7 @@ class MotorSetpoints(NamedTuple):
 
     state: MotorState
     rates: tuple[int, ...] = ()
-    """1/1000 step/s, in the controller's own sign; of RUN."""
+    """Rates for RUN (1/1000 step/s), in the controller's own sign."""
 
 
 def setpoint_of(commands: Sequence[DriveCommand | None], now: int, config: StepperConfig) -> MotorSetpoints:
@@ -55,7 +55,7 @@ def setpoint_of(commands: Sequence[DriveCommand | None], now: int, config: Stepp
     Args:
         commands: latest command of every shaft, if any.
         now: time (ns).
-        config: signs, limits and time-outs.
+        config: signs, limits and timeouts.
     """
     mode, known = requested(commands, now, config.quick_stop_after)
     if mode is not DriveMode.ENABLED:
@@ -85,11 +85,11 @@ class StepperDriver(MotorBoard[StepperConfig, StepperSession]):
         self._motors = config.motors
         """Number of motors of the controller."""
         self._steps = [0] * config.motors
-        """Counted over sessions and restarts of the controller."""
+        """Steps accumulated across sessions and restarts of the controller."""
         self._last: tuple[Status, int] | None = None
         """Latest status and its arrival time."""
         self._noise, self._noted = 0, 0
-        """Damaged lines at the begin of the current window, and its begin (ns)."""
+        """Number of damaged lines at the start of the current window, and the start time (ns)."""
 
     def _session(self, link: Link) -> StepperSession:
         return StepperSession(link, self._clock, self._config.answer_timeout)
@@ -98,8 +98,8 @@ class StepperDriver(MotorBoard[StepperConfig, StepperSession]):
         """See the base class.
 
         Raises:
-            DeviceMismatchError: motors or steps per turn are not those configured.
-            WrongDeviceError: something else answers.
+            DeviceMismatchError: the number of motors or steps per turn differs from the configuration.
+            WrongDeviceError: another device answers.
         """
         config = self._config
         session.send("Q")
@@ -136,7 +136,7 @@ class StepperDriver(MotorBoard[StepperConfig, StepperSession]):
 
         Raises:
             DeviceRestartedError: the controller restarted while it was in use.
-            DeviceStoppedError: its watchdog stopped motors that were to turn.
+            DeviceStoppedError: its watchdog stopped motors that should turn.
         """
         setpoint = self._setpoint()
         self._sent = MODES[setpoint.state]
@@ -170,10 +170,10 @@ class StepperDriver(MotorBoard[StepperConfig, StepperSession]):
             self._noise = splitter.bad
 
     def _check(self, status: Status) -> None:
-        """Notice a controller that restarted.
+        """Detect a restart of the controller.
 
         Raises:
-            DeviceRestartedError: it did, while it was in use.
+            DeviceRestartedError: the controller restarted while in use.
         """
         now = self._clock.now()
         uptime_slack = 200  # tolerated lag of the controller's uptime behind the host's time between two answers (ms)

@@ -1,7 +1,7 @@
-"""The microcontroller's side: lines in, lines out, ramps, watchdog, and steppers that lose steps.
+"""Device side of the stepper controller: line protocol, ramps, watchdog, and steppers that lose steps.
 
-Habits of the real thing: it is silent unless asked, drops damaged lines without a word, knows the steps it commanded
-and not those that the rotor made, steps in whole periods of its timer, and begins at 0 after every power-up.
+Behaviour of the real controller: it sends only answers, ignores damaged lines, counts the commanded steps, not those of
+the rotor, steps at whole periods of its timer, and starts at 0 after every power-up.
 """
 
 import asyncio
@@ -43,13 +43,13 @@ COASTING: Final = 1e6
 class StepperEmulator(FaultyDevice):
     """The controller with its motors.
 
-    Faults (``inject``): ``overload MOTOR on|off`` (the rotor blocks), ``silent on|off`` (gives no answers), ``late
-    SECONDS [COUNT]`` (answers), ``reset`` (the processor restarts at any point), ``noise COUNT``
-    (COUNT answers have a wrong byte), ``runaway`` (the firmware disobeys with all motors, see ``DisobedientMotor``).
+    Faults (``inject``): ``overload MOTOR on|off`` (the rotor blocks), ``silent on|off`` (no answers), ``late SECONDS
+    [COUNT]`` (late answers), ``reset`` (the processor restarts at any point), ``noise COUNT`` (COUNT answers have a
+    wrong byte), ``runaway`` (the firmware disobeys with all motors, see ``DisobedientMotor``).
 
     Args:
         clock: time.
-        plants: loads of the motors; free motors take the missing places.
+        plants: loads of the motors; missing ones are replaced by free motors.
         motors: number of motors.
         steps_per_turn: steps per turn of each motor.
     """
@@ -99,7 +99,7 @@ class StepperEmulator(FaultyDevice):
         self._state = MotorState.OFF
         self._rates = [0.0] * self._identity.motors
         self._ordered = [0.0] * self._identity.motors
-        """Rates of the latest orders (steps/s)."""
+        """Rates of the latest commands (steps/s)."""
         self._counters = [FreeMotor() for _ in self._plants]
         for counter in self._counters:
             counter.reading(now)
@@ -107,7 +107,7 @@ class StepperEmulator(FaultyDevice):
         self._turn(None, self._quick)
 
     def power_cycle(self) -> None:
-        """Supply off and on: coils off, counters at 0, settings of the factory."""
+        """Switch the supply off and on: coils off, counters at 0, settings of the factory."""
         self._boot()
         self._fed_again.set()
 
@@ -198,7 +198,7 @@ class StepperEmulator(FaultyDevice):
         self._turn(None if state is MotorState.OFF else self._ordered, self._quick)
 
     def _turn(self, rates: list[float] | None, acceleration: float) -> None:
-        """Make the steps of rates, steps/s; None: no current."""
+        """Command rates (steps/s); None: no current."""
         self._asked = rates
         rates = self._disobeyed(rates)
         self._powered, self._ramp = rates is not None, acceleration * self._rpm
@@ -221,7 +221,7 @@ class StepperEmulator(FaultyDevice):
         return turning or None
 
     def _drive(self) -> None:
-        """Let the rotors follow, as far as their torque goes."""
+        """Let the rotors follow, within their torque."""
         now = self._clock.now()
         for i, (plant, rate) in enumerate(zip(self._plants, self._rates, strict=True)):
             # 150.0: steps/s below which a rotor that stands follows again
@@ -233,7 +233,7 @@ class StepperEmulator(FaultyDevice):
 
     @property
     def _rpm(self) -> float:
-        """Shaft speed at one step/s (rpm)."""
+        """Shaft speed for one step/s (rpm)."""
         return 60.0 / self._identity.steps_per_turn
 
     def _status(self) -> Status:
@@ -248,7 +248,7 @@ class StepperEmulator(FaultyDevice):
         )
 
     def _reported(self) -> Status:
-        """The status as it is sent."""
+        """Status as it is sent."""
         true, report = self._status(), self.signals.report
         state = report("state", int(true.state))
         return Status(
@@ -264,7 +264,7 @@ class StepperEmulator(FaultyDevice):
         return self._state is MotorState.RUN
 
     async def _watch(self) -> None:
-        """The watchdog: trips although nothing is received."""
+        """Watchdog: trips even if the host is silent."""
         while True:
             self._fed_again.clear()
             if not self._running:
@@ -280,7 +280,7 @@ class StepperEmulator(FaultyDevice):
 
 
 def _stepped(rate: float) -> float:
-    """The rate nearest to ``rate``, steps/s, whose period is a whole number of timer ticks."""
+    """Return the rate nearest to ``rate`` (steps/s) whose period is a whole number of timer ticks."""
     if rate == 0.0:
         return 0.0
     ticks = max(1, round(1e6 / (abs(rate) * TICK_US)))
@@ -288,7 +288,7 @@ def _stepped(rate: float) -> float:
 
 
 def emulated(setup: EmulatorSetup) -> StepperEmulator:
-    """The controller of all driven shafts of a simulated robot, on a line of real speed."""
+    """Create the controller of all driven shafts of a simulated robot, on a line with its real speed."""
     setup.port.device.baud = STEPPERS_BAUD
     steps = {} if setup.settings is None else {"steps_per_turn": setup.settings.steps_per_turn}
     return StepperEmulator(setup.clock, setup.physics.motors[:MOTORS], **steps)

@@ -3,22 +3,25 @@
 115200 baud, 8N1. A line is ``:BODY*CCCC`` and LF, at most 160 bytes: BODY is words of printable ASCII, one space apart,
 CCCC the CRC-16/CCITT-FALSE of BODY (polynomial 0x1021, initial value 0xFFFF) in capital hex digits. The controller
 answers every complete line of the host once, with the request's sequence number (0 to 255), and sends nothing else. The
-first word of a request is a capital letter, of its answer the same in small:
+first word of a request is a capital letter; the answer starts with the same letter in lower case:
 
-======================= ==================================================== ==========================================
-request meaning answer ======================= ====================================================
-========================================== ``I SEQ`` who are you ``i SEQ NAME VERSION MOTORS STEPS PERIOD`` ``C SEQ ACC
-QUICK WD`` ramps, steps/s^2; watchdog (ms); only while at rest ``c SEQ ACC QUICK WD`` ``R SEQ RATE...`` run at rates,
-1/1000 step/s each; feeds the watchdog a status ``Q SEQ`` quick stop, then hold a status ``D SEQ`` coils off a status
-``S SEQ`` look, without feeding the watchdog a status =======================
-==================================================== ==========================================
+======================= =================================================== ==========================================
+request                 meaning                                             answer
+======================= =================================================== ==========================================
+``I SEQ``               identify                                            ``i SEQ NAME VERSION MOTORS STEPS PERIOD``
+``C SEQ ACC QUICK WD``  ramps (steps/s^2), watchdog (ms); only at rest      ``c SEQ ACC QUICK WD``
+``R SEQ RATE...``       run at rates (1/1000 step/s); resets the watchdog   a status
+``Q SEQ``               quick stop, then hold                               a status
+``D SEQ``               coils off                                           a status
+``S SEQ``               read the status without resetting the watchdog      a status
+======================= =================================================== ==========================================
 
 NAME is STEP4, VERSION 1; step periods are multiples of PERIOD us. The watchdog is 50 to 2000 ms. After power-up the
 motors are off at position 0, with 4000 and 8000 steps/s^2 and 500 ms.
 
 A status is ``s SEQ STATE BAD UPTIME POSITION... RATE...``: state (0 off, 1 running, 2 stopped, 3 by the watchdog),
 damaged lines since power-up (0-65535, wraps), uptime in ms (32 bits, wraps), the steps commanded so far (signed 32
-bits, wrap) and the current rate of every motor. The answer to a request that cannot be carried out is ``e SEQ CODE``
+bits, wrap) and the current rate of every motor. The answer to a refused request is ``e SEQ CODE``
 (1 unknown, 2 invalid arguments, 3 not while a motor turns, 4 watchdog tripped: ``R`` needs a ``Q`` or ``D`` first); a
 damaged line gets no answer.
 """
@@ -33,10 +36,10 @@ VERSION: Final = 1
 STEPPERS_BAUD: Final = 115_200
 MOTORS: Final = 4
 MAX_LINE: Final = 160
-"""Bytes of the longest line; the controller drops longer ones."""
+"""Maximum length of a line (bytes); the controller drops longer ones."""
 SEQUENCES: Final = 256
 MAX_RATE: Final = 10_000_000
-"""1/1000 step/s: greatest rate of a request."""
+"""Maximum rate of a request (1/1000 step/s)."""
 
 _START, _END = b":", b"\n"
 _MASK = 0xFFFF_FFFF
@@ -46,26 +49,26 @@ class MotorState(IntEnum):
     """State of the motors."""
 
     OFF = 0
-    """Coils off: they turn freely. So after power-up."""
+    """Coils off: the motors turn freely, as after power-up."""
     RUN = 1
     """The motors follow the rates of the last ``R``."""
     STOPPED = 2
     """Quick stop, then hold."""
     WATCHDOG = 3
-    """Stopped by the watchdog: no ``R`` came in time. ``R`` is refused until a ``Q`` or ``D``."""
+    """Stopped by the watchdog: no ``R`` arrived in time. ``R`` is refused until a ``Q`` or ``D``."""
 
 
 class RefusalCode(IntEnum):
-    """Why a request was not carried out."""
+    """Reason for refusing a request."""
 
     UNKNOWN = 1
-    """No such request."""
+    """Unknown request."""
     ARGUMENTS = 2
-    """Another number of arguments, or one out of range."""
+    """Wrong number of arguments, or an argument out of range."""
     NOT_NOW = 3
-    """Settings change only while all motors are at rest."""
+    """Settings can change only while all motors are at rest."""
     TRIPPED = 4
-    """The watchdog has stopped the motors: ``Q`` or ``D`` first."""
+    """The watchdog has stopped the motors: send ``Q`` or ``D`` first."""
 
 
 class LineError(ValueError):
@@ -74,7 +77,7 @@ class LineError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One line: its letter, sequence number and further words."""
+    """One line: its letter, sequence number and remaining words."""
 
     verb: str
     seq: int
@@ -103,10 +106,10 @@ def crc(data: bytes) -> int:
 
 
 def decode(line: bytes) -> Line:
-    """One whole line with or without its LF.
+    """Decode one complete line, with or without its LF.
 
     Raises:
-        LineError: damaged, or of another protocol.
+        LineError: damaged line, or a line of another protocol.
     """
     text = line.removesuffix(_END)
     body, star, check = text[1:].rpartition(b"*")
@@ -130,13 +133,13 @@ class Splitter:
 
     def __init__(self) -> None:
         self.bad = 0
-        """Lines that were dropped."""
+        """Number of dropped lines."""
         self.strange = b""
-        """Beginning of the latest dropped bytes."""
+        """Start of the latest dropped bytes."""
         self._rest = bytearray()
 
     def feed(self, data: bytes) -> list[Line]:
-        """Lines that are complete with ``data``."""
+        """Return the lines completed by ``data``."""
         self._rest += data
         *whole, rest = self._rest.split(_END)
         self._rest = rest if len(rest) < MAX_LINE else bytearray()
@@ -144,7 +147,7 @@ class Splitter:
             self._drop(bytes(rest))
         lines = []
         for raw in whole:
-            # A line that lost its end is followed by the next one.
+            # A line without its end is followed directly by the next one.
             text = raw[max(raw.rfind(_START), 0) :]
             try:
                 lines.append(decode(bytes(text)))
@@ -162,21 +165,21 @@ class Splitter:
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Who answers."""
+    """Identity of the controller."""
 
     name: str
     version: int
     motors: int
     steps_per_turn: int
     tick_us: int
-    """Timer period, microseconds: time between two steps is a whole number of them."""
+    """Timer period (us); the time between two steps is a multiple of it."""
 
     @classmethod
     def of(cls, line: Line) -> "Identity":
         """Parse an answer to ``I``.
 
         Raises:
-            LineError: something else.
+            LineError: not an identity.
         """
         if line.verb != "i" or len(line.words) != 5:
             raise LineError(f"answer {line.verb!r}: expected an identity")
@@ -184,7 +187,7 @@ class Identity:
         return cls(name, *Line(line.verb, line.seq, tuple(rest)).integers(4))
 
     def line(self, seq: int) -> Line:
-        """The answer that states it."""
+        """Encode the identity as an answer."""
         numbers = (self.version, self.motors, self.steps_per_turn, self.tick_us)
         return Line("i", seq, (self.name, *map(str, numbers)))
 
@@ -197,16 +200,16 @@ class Status:
     bad_lines: int
     uptime_ms: int
     positions: tuple[int, ...]
-    """Steps commanded, signed 32 bits."""
+    """Commanded steps, signed 32 bits."""
     rates: tuple[int, ...]
-    """1/1000 step/s."""
+    """Rates (1/1000 step/s)."""
 
     @classmethod
     def of(cls, line: Line, motors: int) -> "Status":
         """Parse an answer of a controller with ``motors`` motors.
 
         Raises:
-            LineError: something else.
+            LineError: not a status.
         """
         if line.verb != "s":
             raise LineError(f"answer {line.verb!r}: expected a status")
@@ -216,16 +219,16 @@ class Status:
         return cls(MotorState(state), bad, uptime, tuple(rest[:motors]), tuple(rest[motors:]))
 
     def line(self, seq: int) -> Line:
-        """The answer that states it."""
+        """Encode the status as an answer."""
         numbers = (int(self.state), self.bad_lines, self.uptime_ms, *self.positions, *self.rates)
         return Line("s", seq, tuple(map(str, numbers)))
 
 
 def wrapped(steps: int) -> int:
-    """Steps as the controller counts them, signed 32 bits."""
+    """Wrap a number of steps to the controller's signed 32-bit counter."""
     return (steps + (1 << 31) & _MASK) - (1 << 31)
 
 
 def step_of(before: int, now: int) -> int:
-    """Steps from one position to the next, over the wrap of the counter."""
+    """Steps between two positions, across the wrap of the counter."""
     return wrapped(now - before)

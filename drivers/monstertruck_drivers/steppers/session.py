@@ -1,4 +1,4 @@
-"""Requests and replies, with the controller over one open link; shared by the driver and `identify`."""
+"""Requests and replies of the controller over one open link; shared by the driver and `identify`."""
 
 from typing import Final
 
@@ -18,15 +18,15 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
 
 ASK_ATTEMPTS: Final = 3
-"""Tries of the requests of a session's beginning."""
+"""Attempts for each request at the start of a session."""
 
 
 class RequestRefusedByDeviceError(ProtocolError):
     """The controller does not carry out a request.
 
     Args:
-        text: who, what and why.
-        code: its own code.
+        text: controller, request and reason.
+        code: the controller's error code.
     """
 
     def __init__(self, text: str, code: int) -> None:
@@ -48,7 +48,7 @@ class StepperSession:
         self.asked = 0
         """Send time of the latest request (ns)."""
         self.heard = False
-        """A line of the protocol came."""
+        """Whether a line of the protocol has arrived."""
         self._link = link
         self._clock = clock
         self._timeout = timeout
@@ -69,7 +69,7 @@ class StepperSession:
 
         Raises:
             DeviceLostError: unplugged.
-            DeviceTimeoutError: no answer in time.
+            DeviceTimeoutError: no answer within the timeout.
             ProtocolError: the controller refuses the request.
         """
         for _ in range(attempts):
@@ -83,7 +83,7 @@ class StepperSession:
         raise DeviceTimeoutError(f"{self._link.name}: no answer to {verb} within {self._timeout} s")
 
     async def status(self, verb: str, motors: int, *words: int, attempts: int = 1) -> Status:
-        """Send a request that is answered by a status. Raises as ``ask`` does."""
+        """Send a request that is answered by a status. Raises the errors of ``ask``."""
         answer = await self.ask(verb, *words, attempts=attempts)
         try:
             return Status.of(answer, motors)
@@ -91,12 +91,12 @@ class StepperSession:
             raise ProtocolError(f"{self._link.name}: {error}") from error
 
     async def identify(self) -> Identity:
-        """Who answers.
+        """Identify the controller.
 
         Raises:
             DeviceLostError: unplugged.
             DeviceTimeoutError: silence.
-            WrongDeviceError: something else answers.
+            WrongDeviceError: another device answers.
         """
         try:
             identity = Identity.of(await self.ask("I", attempts=ASK_ATTEMPTS))
@@ -142,7 +142,7 @@ async def identify(link: Link, clock: Clock, settings: StepperConfig) -> dict[st
         (steps), ``rates`` (steps/s).
 
     Raises:
-        DeviceError: as the driver's ``run``.
+        DeviceError: see the driver's ``run``.
     """
     session = StepperSession(link, clock, settings.answer_timeout)
     identity = await session.identify()

@@ -1,1 +1,1 @@
-"""USB as the truck sees it: devices named by hub and port, hubs that vanish and return as one."""
+"""USB devices identified by hub and port; a hub with its devices is lost and returns as one event."""

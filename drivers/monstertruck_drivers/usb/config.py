@@ -1,4 +1,4 @@
-"""Configuration of the USB tree: places of devices, judgement of hubs, switching of ports."""
+"""Configuration of the USB tree: device places, hub outages, power of ports."""
 
 from enum import StrEnum
 from typing import Annotated, Self
@@ -22,10 +22,10 @@ class UsbPortConfig(Schema):
     hub: Annotated[
         str, Field(pattern=r"^(usb[0-9]+|[0-9]+-[0-9]+(\.[0-9]+)*|[a-zA-Z][^\s/\"]*-usb-0:(0|[0-9]+(\.[0-9]+)*))$")
     ]
-    """The hub by topology, as ``find-port`` writes it: "pci-0000:00:14.0-usb-0:1", with "usb-0:0" for a root hub; or \
+    """Hub by topology, as ``find-port`` writes it: "pci-0000:00:14.0-usb-0:1", with "usb-0:0" for a root hub; or \
 its kernel's name, which may change with the next boot: "1-1", or "usb1" for a root hub"""
     port: Annotated[int, Field(ge=1, le=31)]
-    """Port of the hub"""
+    """Port number on the hub"""
     interface: Annotated[int, Field(ge=0, le=31)] = 0
     """USB interface of the serial line; a Maestro takes commands at 0"""
     baud: Baud | None = None
@@ -35,7 +35,7 @@ its kernel's name, which may change with the next boot: "1-1", or "usb1" for a r
     rts: bool = True
     """Level of the line RTS while the port is open"""
     framing: Framing | None = None
-    """Bits of a byte; null selects the device's default"""
+    """Format of a byte; null selects the device's default"""
     usb_id: Annotated[str, Field(pattern=r"^[0-9a-f]{4}:[0-9a-f]{4}$")] | None = None
     """Expected vendor:product, checked before the first byte; None leaves it to the handshake"""
     latency_ms: Annotated[int, Field(ge=1, le=255)] = 1
@@ -43,7 +43,7 @@ its kernel's name, which may change with the next boot: "1-1", or "usb1" for a r
 
     @property
     def device(self) -> str:
-        """Name of a device plugged in at this place."""
+        """Kernel name of a device plugged in at this place."""
         return device_name(self.hub, self.port)
 
     @property
@@ -96,9 +96,9 @@ class UsbConfig(Schema):
     """Settings for watching the USB tree."""
 
     rescan: Annotated[float, Field(ge=0.2, le=60)] = 5.0
-    """Interval between checks of the tree without announcements (s)"""
+    """Interval between reads of the tree without change notifications (s)"""
     together: Seconds = 0.2
-    """Time without a further loss before losses are judged (s): losses behind one hub are one loss of the hub"""
+    """Waiting time after the last loss before losses are judged (s): losses behind one hub are one loss of the hub"""
     settle: Seconds = 0.5
     """Time without change behind a returned hub before its devices start (s)"""
     empty_timeout: Seconds = 3.0

@@ -1,4 +1,4 @@
-"""Emulated machine with USB hubs: a sysfs tree in a folder, announcements, cables that can be pulled.
+"""Emulated machine with USB hubs: a sysfs tree in a folder, change notifications, and cables that can be unplugged.
 
 The folder contains the parts of ``/sys`` and ``/dev`` that this package reads and writes. Serial nodes lead to emulated
 ports, so all code above runs as on a robot, with either clock.
@@ -180,7 +180,7 @@ class EmulatedUsb:
         self._vanish(name)
 
     def lose_hub(self, name: str) -> None:
-        """Drop a hub off the bus: its devices vanish, then the hub, although every cable is plugged in."""
+        """Make a hub drop off the bus: its devices vanish, then the hub, while every cable stays plugged in."""
         self._vanish(self._devices[name].name)
 
     async def return_hub(self, name: str, clock: Clock, *, first: float = 0.2, between: float = ENUMERATION) -> None:
@@ -228,7 +228,7 @@ class EmulatedUsb:
                 self.plug(name)
 
     def claim(self, name: str) -> None:
-        """Let a program claim the interface of a device's node through usbfs, as brltty does: the node vanishes."""
+        """Let a program claim the interface of a device's node through usbfs, as brltty does; the node vanishes."""
         device = self._devices[name]
         self._unbind(device)
         interface = f"{name}:1.{device.interface}"

@@ -1,10 +1,10 @@
 """Combine simultaneous losses behind a hub into one event, and start the hub's devices in sequence.
 
-A ``HubCoordinator`` compares snapshots and judges losses together after a short while. If a hub is gone, or all of its
-several devices are, the topmost such hub is the event, and everything behind it waits for the hub. Once the tree behind
-the returned hub is stable, its devices may start in order of safety. Devices that load the hub start with a delay after
-their predecessor: a lidar and a camera draw their in-rush at the start, interfaces drew theirs when plugged in. A
-device may also have to wait because its port reported over-current.
+A ``HubCoordinator`` compares snapshots and judges losses together after a short while. If a hub has vanished, or all of
+its several devices have, the topmost such hub is reported, and all devices behind it wait for the hub. Once the tree
+behind the returned hub is stable, its devices may start in order of safety. Devices that load the hub start with a
+delay after their predecessor: a lidar and a camera draw their in-rush current at the start, interfaces when plugged in.
+A device may also have to wait because its port reported over-current.
 """
 
 import asyncio
@@ -90,7 +90,7 @@ class HubCoordinator:
         """Root hubs by controller and speed, as last seen."""
         self._turn = asyncio.Event()
         self.on_miss: Callable[[], None] = lambda: None
-        """Called when a port found no device plugged in, to have the tree read."""
+        """Called when a port finds no device plugged in, to request a read of the tree."""
 
     # Queries of a port
 
@@ -420,7 +420,7 @@ PERIOD: Final = SECOND
 
 
 class UsbService:
-    """Reads the tree on an announcement, a missed device or a due decision, and every few seconds anyway.
+    """Reads the tree on a change notification, a missed device or a due decision, and at least every few seconds.
 
     Without this service no device waits for a hub.
 

@@ -1,4 +1,4 @@
-"""Read the USB tree from sysfs: names, parents, identities, nodes. Pure: one look, no state.
+"""Read the USB tree from sysfs: names, parents, identities, nodes. Stateless.
 
 Names are kernel names: ``usb1`` is the root hub of bus 1, ``1-2`` is on its port 2, ``1-2.3`` on port 3 of the hub
 there; ``1-2.3:1.0`` is interface 0 of that device in configuration 1, and ``1-2:1.0/1-2-port3`` is the port itself.

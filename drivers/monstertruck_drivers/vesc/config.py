@@ -15,27 +15,27 @@ RAD_S_PER_RPM = 2 * math.pi / 60
 
 
 class VescMotorConfig(Schema):
-    """One controller: the one that is connected, or one behind it on its CAN bus."""
+    """One controller: the connected one, or one behind it on the CAN bus."""
 
     can_id: Annotated[int, Field(ge=0, le=254)] | None = None
-    """Its CAN id; null: the connected one"""
+    """CAN id; null: the connected controller"""
     inverted: bool = False
-    """Driving forward takes negative speeds"""
+    """Whether driving forward needs negative speeds"""
 
 
 class VescServoConfig(Schema):
-    """Servo output: ``position = centre + direction * per_radian * servo angle``, 0 to 1 of its range of pulses."""
+    """Servo output: ``position = centre + direction * per_radian * servo angle``, 0 to 1 of its pulse range."""
 
     centre: Position = 0.5
     """Position that steers straight ahead"""
     per_radian: Annotated[float, Field(gt=0, le=10)] = 1.0
-    """Change of the position for each radian of servo angle"""
+    """Change of the position per radian of servo angle"""
     direction: Literal[-1, 1] = -1
-    """+1 where a greater position steers left, -1 where it steers right"""
+    """+1 if a larger position steers left, -1 if it steers right"""
     min: Position = 0.15
-    """Smallest position commanded."""
+    """Minimum commanded position."""
     max: Position = 0.85
-    """Largest position commanded."""
+    """Maximum commanded position."""
     dead_time: Annotated[float, Field(ge=0, le=1)] | None = None
     """Dead time from a steering command to the first movement of the wheels (s); null if it was not measured"""
     lag: Annotated[float, Field(ge=0, le=1)] | None = None
@@ -48,16 +48,16 @@ class VescServoConfig(Schema):
         return self
 
     def position(self, angle: float) -> float:
-        """Position for a servo angle, rad, left positive, held within the limits."""
+        """Position for a servo angle (rad, left positive), clamped to the limits."""
         return min(max(self.centre + self.direction * self.per_radian * angle, self.min), self.max)
 
     def angle(self, position: float) -> float:
-        """Servo angle, rad, left positive, of a position."""
+        """Servo angle (rad, left positive) of a position."""
         return (position - self.centre) * self.direction / self.per_radian
 
     @property
     def reach(self) -> tuple[float, float]:
-        """Servo angles, rad, to the right (negative) and to the left."""
+        """Servo angles (rad) at the limits: to the right (negative) and to the left."""
         right, left = sorted(map(self.angle, (self.min, self.max)))
         return right, left
 
@@ -74,20 +74,21 @@ class VescConfig(Schema):
         VescMotorConfig(),
     )
     pole_pairs: Annotated[int, Field(ge=1, le=50)] = 2
-    """Electrical turns in one turn of the motor"""
+    """Electrical turns per turn of the motor"""
     max_motor_rpm: Annotated[int, Field(gt=0, le=100_000)] = 6000
-    """Requests are limited to this"""
+    """Maximum motor speed (rpm); requests are limited to it"""
     min_motor_rpm: Annotated[float, Field(ge=0, le=10_000)] = 0.0
-    """Slower set-points brake instead: below its `s_pid_min_erpm` the controller gives no torque; that setting divided
-    by pole_pairs"""
+    """Minimum motor speed (rpm): slower set-points brake instead, because the controller gives no torque below
+    `s_pid_min_erpm`. Set it to that setting divided by pole_pairs
+    """
     deceleration_rpm_s: Annotated[float, Field(gt=0)] = 12_000.0
-    """Deceleration by a lower set-point, as measured, rpm/s; set by the controller's own ramp and current limits"""
+    """Measured deceleration at a lower set-point (rpm/s); the controller's own ramp and current limits determine it"""
     quick_stop_deceleration_rpm_s: Annotated[float, Field(gt=0)] = 15_000.0
-    """Deceleration by brake_current, as measured, rpm/s"""
+    """Measured deceleration at brake_current (rpm/s)"""
     brake_current: Annotated[float, Field(gt=0, le=200)] = 20.0
     """Current of the quick stop and of the controller's watchdog (A)"""
     standstill_rpm: Annotated[float, Field(gt=0, le=10_000)] = 60.0
-    """Slower than this counts as at rest"""
+    """Speed below which the motor is at rest (rpm)"""
     servo: VescServoConfig | None = None
     """Servo output, which steers the front axle; null: another device steers, or nothing does"""
     battery: PackConfig | None = None
@@ -105,7 +106,7 @@ class VescConfig(Schema):
 
     @property
     def shafts(self) -> int:
-        """How many driven shafts it serves."""
+        """Number of driven shafts."""
         return len(self.motors)
 
     @property
@@ -126,7 +127,7 @@ class VescConfig(Schema):
 
     @property
     def stop_words(self) -> str:
-        """Brake current, A, electrical speed of standstill, rpm, and CAN ids, for the stop script."""
+        """Brake current (A), electrical standstill speed (rpm) and CAN ids, for the stop script."""
         ids = ",".join("" if motor.can_id is None else str(motor.can_id) for motor in self.motors)
         return f"{self.brake_current:g}:{self.standstill_rpm * self.pole_pairs:g}:{ids}"
 

@@ -1,10 +1,10 @@
 """Driver of VESCs on one port: ``cmd/drive*`` and ``cmd/steering`` in; feedback of motors, servo and battery out.
 
-One exchange a cycle with every controller: its set-point goes out, its values come back. A quick stop is a brake
+One exchange per cycle with every controller sends its set-point and receives its values. A quick stop is a brake
 current, sent again in every cycle; a disabled motor coasts.
 
-Every set-point feeds the controller's watchdog, which is set at the start of a session and brakes when the host is
-silent. The first packets of a session brake, and so do the last ones until the motors rest; then they coast.
+Every set-point resets the controller's watchdog, which is set at the start of a session and brakes when the host is
+silent. A session brakes the motors at its start, and at its end until they rest; then they coast.
 """
 
 import contextlib
@@ -52,7 +52,7 @@ def setpoint_of(commands: Sequence[DriveCommand | None], now: int, config: VescC
     Args:
         commands: latest command of every shaft, if any.
         now: time (ns).
-        config: limits and time-outs.
+        config: limits and timeouts.
     """
     mode, known = requested(commands, now, config.command_timeout)
     if mode is not DriveMode.ENABLED:
@@ -81,8 +81,8 @@ class VescDriver(MotorBoard[VescConfig, VescSession]):
         clock: time.
         steering_commands: ``cmd/steering``.
         drive: feedback of the first motor, whose current explains the battery's sag.
-        steering: position sent to the servo, as an angle; None when another device steers.
-        battery: pack voltage; None when the battery is measured elsewhere.
+        steering: position sent to the servo, as an angle; None if another device steers.
+        battery: pack voltage; None if another device measures the battery.
         events: identity, restarts, faults.
         name: name of the service.
         ends: topics of the shafts.
@@ -110,10 +110,10 @@ class VescDriver(MotorBoard[VescConfig, VescSession]):
             self._battery = BatteryMonitor(config.battery, battery, events, name, drive)
         self._battery_due = 0
         self._ticks = [0] * config.shafts
-        """Counted over sessions and restarts of the controllers."""
+        """Tachometer steps accumulated across sessions and restarts of the controllers."""
         self._last: list[MotorValues | None] = [None] * config.shafts
         self._faults = [0] * config.shafts
-        """Faults that were reported and are still there."""
+        """Reported faults that are still present."""
         self._position: float | None = None
         """Latest position sent to the servo."""
 
@@ -125,7 +125,7 @@ class VescDriver(MotorBoard[VescConfig, VescSession]):
 
         Raises:
             DeviceMismatchError: no controller at a CAN id, old firmware, or a watchdog that cannot be set.
-            WrongDeviceError: something else answers.
+            WrongDeviceError: another device answers.
         """
         config = self._config
         self._position = None
@@ -154,7 +154,7 @@ class VescDriver(MotorBoard[VescConfig, VescSession]):
             await self._read(session, i)
 
     def _send_all(self, session: VescSession, setpoint: VescSetpoint) -> None:
-        """Set-points of all motors and of the servo, in one go."""
+        """Send the set-points of all motors and of the servo together."""
         self._sent = setpoint.mode
         for i, motor in enumerate(self._config.motors):
             session.send(motor.can_id, payload_of(setpoint, i, self._config))
@@ -180,10 +180,10 @@ class VescDriver(MotorBoard[VescConfig, VescSession]):
                 self._battery.take(stamp, received, values.volts, at_limit=False)
 
     def _count(self, i: int, values: MotorValues) -> None:
-        """Add up the motor's steps.
+        """Accumulate the motor's steps.
 
         Raises:
-            DeviceRestartedError: the controller counts from 0 again.
+            DeviceRestartedError: the controller restarted at 0.
         """
         last = self._last[i]
         self._last[i] = values

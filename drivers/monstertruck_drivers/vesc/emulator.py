@@ -35,13 +35,13 @@ from monstertruck_drivers.vesc.protocol import (
 from monstertruck_runtime.clock import MILLISECOND, SECOND, Clock
 
 FACTORY: Final = WatchdogSetting(1000, 0.0)
-"""Watchdog as delivered."""
+"""Factory setting of the watchdog."""
 SETTINGS_SIZE: Final = 480
-"""Bytes of the settings' answer."""
+"""Size of the answer with the settings (bytes)."""
 SIGNATURE: Final = bytes.fromhex("7d21b4f8")
-"""Begins the settings; any number does, the host returns it."""
+"""Start of the settings; any number is valid, because the host returns it."""
 NO_LOAD_PER_VOLT: Final = 400.0
-"""Rpm of the motor for each volt, at full duty."""
+"""No-load speed per volt at full duty (rpm/V)."""
 HARDWARE: Final = "60"
 
 
@@ -72,7 +72,7 @@ class EmulatedController:
         self.restart()
 
     def restart(self) -> None:
-        """Power-up: coasting, counters at 0, watchdog as delivered."""
+        """Restart as after power-up: coasting, counters at 0, factory watchdog."""
         now = self._clock.now()
         self.watchdog = FACTORY
         self.timed_out = False
@@ -83,7 +83,7 @@ class EmulatedController:
         self._turn(None)
 
     def feed(self) -> None:
-        """Take note of a set-point."""
+        """Record a set-point, which resets the watchdog."""
         self._fed, self.timed_out = self._clock.now(), False
 
     def watch(self) -> None:
@@ -94,14 +94,14 @@ class EmulatedController:
             self.brake(self.watchdog.brake_current)
 
     def fail(self, code: int) -> None:
-        """Take a fault: the motor coasts, and obeys nothing for a while; 0 ends one that stays."""
+        """Start a fault: the motor coasts, and set-points are ignored for a while; 0 ends a permanent fault."""
         self.fault = code
-        fault_stop = 500 * MILLISECOND  # time after a fault in which the controller takes no set-point
+        fault_stop = 500 * MILLISECOND  # time after a fault in which the controller ignores set-points
         self._blocked_until = self._clock.now() + fault_stop
         self._turn(None)
 
     def run(self, erpm: float) -> None:
-        """Hold an electrical speed; a speed below the least gives no torque."""
+        """Hold an electrical speed; below the minimum speed there is no torque."""
         rpm = erpm / self._config.pole_pairs
         slow = abs(rpm) < self._config.min_motor_rpm
         self._turn(None if slow else rpm, self._config.deceleration_rpm_s)
@@ -120,7 +120,7 @@ class EmulatedController:
         self._turn(target, share * self._config.quick_stop_deceleration_rpm_s or 1.0)
 
     def duty(self, share: float) -> None:
-        """Run at a share of the speed that the supply allows."""
+        """Run at a fraction of the speed that the supply allows."""
         free = NO_LOAD_PER_VOLT * self._plant.reading(self._clock.now()).supply_v
         self._turn(share * free, self._config.deceleration_rpm_s)
 
@@ -134,14 +134,14 @@ class EmulatedController:
         return bytes((PacketId.GET_APPCONF,)) + SIGNATURE + bytes((self.can_id,)) + watchdog + self._tail
 
     def apply(self, payload: bytes) -> bool:
-        """Take temporary settings; return False if their signature belongs to another firmware."""
+        """Apply temporary settings; return False if their signature belongs to another firmware."""
         if payload[1:5] != SIGNATURE or len(payload) < SETTINGS_SIZE:
             return False
         self.watchdog = WatchdogSetting.of(bytes((PacketId.GET_APPCONF,)) + payload[1:])
         return True
 
     def values(self) -> MotorValues:
-        """Present values as they are sent."""
+        """Current values as they are sent."""
         now, report, n = self._clock.now(), self._signals.report, self._place
         reading, turns = self._plant.reading(now), self._turns(now)
         self._travel += abs(turns - self._seen)
@@ -165,7 +165,7 @@ class EmulatedController:
         return self._plant.reading(now).turns
 
     def _turn(self, rpm: float | None, acceleration: float = 1.0) -> None:
-        """Ask the motor for a speed; None lets it coast."""
+        """Command a speed; None lets the motor coast."""
         self._asked = rpm, acceleration
         now = self._clock.now()
         if self.fault or now < self._blocked_until:
@@ -178,14 +178,14 @@ class EmulatedController:
 class VescEmulator(FaultyDevice):
     """All controllers on one port.
 
-    Faults (``inject``): ``silent on|off`` (gives no answers), ``late SECONDS [COUNT]`` (answers), ``noise COUNT`` (the
+    Faults (``inject``): ``silent on|off`` (no answers), ``late SECONDS [COUNT]`` (late answers), ``noise COUNT`` (the
     next COUNT answers have a wrong byte), ``reset`` (all restart), ``fault CODE [MOTOR]`` (0 ends it),
-    ``no_store on|off`` (firmware that knows no temporary settings), ``firmware MAJOR MINOR``, ``runaway`` (all disobey,
+    ``no_store on|off`` (firmware without temporary settings), ``firmware MAJOR MINOR``, ``runaway`` (all disobey,
     see ``DisobedientMotor``).
 
     Args:
         clock: time.
-        plants: loads of the motors; free motors take the missing places.
+        plants: loads of the motors; missing ones are replaced by free motors.
         servos: steering servos; the output moves the servo on channel 0. None: not connected.
         settings: list of controllers.
         own_id: CAN id of the connected controller.
@@ -250,7 +250,7 @@ class VescEmulator(FaultyDevice):
         return low + self.position * (high - low)
 
     def power_cycle(self) -> None:
-        """Supply off and on: all controllers restart."""
+        """Switch the supply off and on: all controllers restart."""
         if self._servos is not None:
             self._servos.advance(self._clock.now())
         boot = 500 * MILLISECOND  # from power-up to the first answer
@@ -301,7 +301,7 @@ class VescEmulator(FaultyDevice):
         if payload[0] == PacketId.SET_SERVO_POS and len(payload) == 3:
             self._set_servo(int.from_bytes(payload[1:], "big", signed=True) / SERVO_SCALE)
         elif controller is not None and (answer := self._obey(controller, payload)) is not None:
-            restart_of_apps = 0.05  # seconds by which a change of settings delays the answer
+            restart_of_apps = 0.05  # delay of the answer after a change of settings (s)
             late = restart_of_apps if payload[0] == PacketId.SET_APPCONF_NO_STORE else 0.0
             self._send(end, answer, delay + late)
 
@@ -314,7 +314,7 @@ class VescEmulator(FaultyDevice):
         self.signals.order("servo", position, move)
 
     def _obey(self, controller: EmulatedController, payload: bytes) -> bytes | None:
-        """Carry out a payload; returns its answer, if it has one."""
+        """Execute a payload; return its answer, if it has one."""
         match payload[0]:
             case PacketId.FW_VERSION:
                 serial = bytes((controller.can_id,)) * 12
@@ -333,7 +333,7 @@ class VescEmulator(FaultyDevice):
         return None
 
     def _set(self, controller: EmulatedController, number: int, value: int) -> None:
-        """Take a set-point."""
+        """Execute a set-point."""
         place = self.controllers.index(controller) + 1
         order = partial(self.signals.order, f"run_{place}")
         match number:
@@ -363,7 +363,7 @@ def _limited(value: float, limit: float) -> float:
 
 
 def emulated(setup: EmulatorSetup) -> VescEmulator:
-    """The controllers of a simulated robot; the servo output moves the servo on channel 0."""
+    """Create the controllers of a simulated robot; the servo output moves the servo on channel 0."""
     settings: VescConfig = setup.settings or VescConfig()
     setup.port.device.baud = VESC_BAUD
     servos = None if settings.servo is None else setup.physics.servos

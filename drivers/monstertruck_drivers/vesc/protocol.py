@@ -1,7 +1,7 @@
-"""Packets of the VESC; pure codec, standard library only, which the stop script needs.
+"""Packets of the VESC; pure codec that needs only the standard library, as the stop script requires.
 
-A packet is a start byte, the length of its payload, the payload, a CRC of the payload (polynomial 0x1021 that begins
-at 0, high byte first) and a stop byte. The start byte 2 has one length byte, 3 has two. The first byte of the payload
+A packet is a start byte, the length of its payload, the payload, a CRC of the payload (polynomial 0x1021, initial value
+0, high byte first) and a stop byte. The start byte 2 has one length byte, 3 has two. The first byte of the payload
 names the packet; numbers are big-endian and scaled. Source: VESC firmware (vedderb/bldc), ``comm/packet.c`` (framing),
 ``comm/commands.c`` (payloads), ``datatypes.h`` (packet and fault codes), ``confgenerator.c`` (settings).
 """
@@ -17,12 +17,12 @@ SHORT: Final = 2
 LONG: Final = 3
 STOP: Final = 3
 MAX_PAYLOAD: Final = 512
-"""Longest payload of the firmware (bytes)."""
+"""Maximum payload of the firmware (bytes)."""
 TICKS_PER_ELECTRICAL_TURN: Final = 6
-"""Steps of the tachometer in one electrical turn."""
+"""Tachometer steps per electrical turn."""
 SERVO_SCALE: Final = 1000.0
 OLDEST_FIRMWARE: Final = 5
-"""Oldest major version whose packets are these."""
+"""Oldest supported major version of the firmware."""
 
 
 class PacketId(IntEnum):
@@ -39,7 +39,7 @@ class PacketId(IntEnum):
     ALIVE = 30
     FORWARD_CAN = 34
     SET_APPCONF_NO_STORE = 149
-    """Settings until the next power-up; answered by its own number."""
+    """Settings until the next power-up; the answer is this packet's number."""
 
 
 class PacketError(ValueError):
@@ -50,7 +50,7 @@ def frame(payload: bytes) -> bytes:
     """Return a payload as a packet.
 
     Raises:
-        ValueError: no payload, or one too long.
+        ValueError: the payload is empty or too long.
     """
     if not 0 < len(payload) <= MAX_PAYLOAD:
         raise ValueError(f"payload of {len(payload)} bytes: expected 1 to {MAX_PAYLOAD}")
@@ -59,17 +59,17 @@ def frame(payload: bytes) -> bytes:
 
 
 class Deframer:
-    """Cuts a stream of bytes into payloads, however it arrives; bytes that belong to no packet are counted."""
+    """Splits a byte stream, in chunks of any size, into payloads; counts the bytes outside of packets."""
 
     def __init__(self) -> None:
         self.bad = 0
-        """Bytes that belonged to no packet."""
+        """Number of bytes outside of packets."""
         self.strange = b""
-        """Latest of them."""
+        """Latest bytes outside of packets."""
         self._rest = bytearray()
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Return payloads that are complete with ``data``."""
+        """Return the payloads completed by ``data``."""
         self._rest += data
         payloads = []
         while self._rest:
@@ -86,7 +86,7 @@ class Deframer:
         return payloads
 
     def restart(self) -> None:
-        """Forget the beginning of a packet whose rest will not come."""
+        """Drop an incomplete packet."""
         self._rest.clear()
 
     def _head(self) -> int:
@@ -94,7 +94,7 @@ class Deframer:
         return self._rest[0]
 
     def _size(self) -> int | None:
-        """Length of the packet at the beginning; 0 if there is none, None if more bytes are needed to say."""
+        """Length of the packet at the start of the buffer; 0 if there is none, None if more bytes are needed."""
         rest = self._rest
         if rest[0] not in (SHORT, LONG):
             return 0
@@ -114,12 +114,12 @@ class Deframer:
 
 
 def forwarded(can_id: int | None, payload: bytes) -> bytes:
-    """Return a payload for the controller at a CAN id behind the connected one; None is the connected one."""
+    """Wrap a payload for the controller at a CAN id; None addresses the connected controller."""
     return payload if can_id is None else bytes((PacketId.FORWARD_CAN, can_id)) + payload
 
 
 def request(packet: PacketId) -> bytes:
-    """Payload of a packet without content."""
+    """Return the payload of a packet without content."""
     return bytes((packet,))
 
 
@@ -134,7 +134,7 @@ def set_current(amperes: float) -> bytes:
 
 
 def set_brake(amperes: float) -> bytes:
-    """Payload that brakes with a current, A, until the motor stands."""
+    """Payload that brakes with a current (A) until the motor stops."""
     return struct.pack(">Bi", PacketId.SET_CURRENT_BRAKE, round(1000 * amperes))
 
 
@@ -158,7 +158,7 @@ class FirmwareIdentity:
         """Parse a payload.
 
         Raises:
-            PacketError: something else.
+            PacketError: not a firmware version.
         """
         name, end, rest = payload[3:].partition(b"\0")
         if payload[:1] != bytes((PacketId.FW_VERSION,)) or not end or len(rest) < 12:
@@ -166,7 +166,7 @@ class FirmwareIdentity:
         return cls(payload[1], payload[2], name.decode("ascii", "backslashreplace"), rest[:12])
 
     def payload(self) -> bytes:
-        """The answer that states it."""
+        """Encode the identity as an answer."""
         head = bytes((PacketId.FW_VERSION, self.major, self.minor)) + self.hardware.encode("ascii") + b"\0"
         # Pairing, test version, hardware type, custom settings, phase filters, two interfaces, radio, name.
         return head + self.serial + bytes(9)
@@ -179,33 +179,33 @@ _LATER: Final = struct.Struct(">hhhiiB")
 
 @dataclass(frozen=True, slots=True)
 class MotorValues:
-    """Answer to ``GET_VALUES`` as far as it is used, in its units and the controller's sign."""
+    """Answer to ``GET_VALUES``: the fields used, in its units and the controller's sign."""
 
     motor_current: float
-    """A."""
+    """Motor current (A)."""
     duty: float
-    """-1..1."""
+    """Duty cycle, -1..1."""
     erpm: int
     """Electrical speed (rpm)."""
     volts: float
-    """Supply (V)."""
+    """Supply voltage (V)."""
     tachometer: int
-    """Sixths of electrical turns since power-up, signed 32 bits, wraps."""
+    """Tachometer (sixths of electrical turns since power-up); signed 32 bits, wraps."""
     tachometer_abs: int
-    """The same, counted up in both directions."""
+    """Like ``tachometer``, but increasing in both directions."""
     fault: int
     controller_id: int
     celsius: float = 25.0
-    """Temperature of the transistors."""
+    """Temperature of the transistors (degrees Celsius)."""
     timed_out: bool = False
-    """Its watchdog has taken the motor."""
+    """Whether the watchdog controls the motor."""
 
     @classmethod
     def of(cls, payload: bytes) -> Self:
         """Parse a payload; later firmware may append fields.
 
         Raises:
-            PacketError: something else.
+            PacketError: not the values of a motor.
         """
         if len(payload) < _VALUES.size or payload[0] != PacketId.GET_VALUES:
             raise PacketError(f"{payload[:20].hex(' ')}: expected values of a motor, {_VALUES.size} bytes or more")
@@ -248,12 +248,12 @@ class MotorValues:
 
 _WATCHDOG: Final = struct.Struct(">If")
 _WATCHDOG_AT: Final = 6
-"""Place of the watchdog's settings in a payload of settings: behind packet, signature (4 bytes) and CAN id."""
+"""Offset of the watchdog's settings in a settings payload: after packet, signature (4 bytes) and CAN id."""
 
 
 @dataclass(frozen=True, slots=True)
 class WatchdogSetting:
-    """Watchdog of the controller: it brakes when it gets no set-point."""
+    """Watchdog of the controller: it brakes without set-points."""
 
     milliseconds: int
     """Time without a set-point until the watchdog acts (ms); 0 = never."""
@@ -265,14 +265,14 @@ class WatchdogSetting:
         """Parse an answer to ``GET_APPCONF``.
 
         Raises:
-            PacketError: something else.
+            PacketError: not the settings.
         """
         if len(settings) < _WATCHDOG_AT + _WATCHDOG.size or settings[0] != PacketId.GET_APPCONF:
             raise PacketError(f"{settings[:20].hex(' ')}: expected settings")
         return cls(*_WATCHDOG.unpack_from(settings, _WATCHDOG_AT))
 
     def applied(self, settings: bytes) -> bytes:
-        """Payload that puts these into settings as read, all others unchanged, until the next power-up."""
+        """Return a payload that writes this watchdog into the settings read, until the next power-up."""
         end = _WATCHDOG_AT + _WATCHDOG.size
         new = _WATCHDOG.pack(self.milliseconds, self.brake_current)
         return bytes((PacketId.SET_APPCONF_NO_STORE,)) + settings[1:_WATCHDOG_AT] + new + settings[end:]
@@ -283,7 +283,7 @@ FAULTS: Final = (
     *("motor too hot", "gate driver over voltage", "gate driver under voltage", "processor under voltage"),
     *("restarted by its own watchdog", "encoder connection"),
 )
-"""Texts of fault codes, from 0 on."""
+"""Texts of the fault codes, starting with 0."""
 
 
 def fault_text(code: int) -> str:
@@ -292,15 +292,15 @@ def fault_text(code: int) -> str:
 
 
 def wrapped(value: int) -> int:
-    """A number as a signed 32-bit counter shows it."""
+    """Wrap a number to a signed 32-bit counter."""
     return (value + (1 << 31)) % (1 << 32) - (1 << 31)
 
 
 def step(before: int, now: int) -> int:
-    """Steps from one reading of a counter to the next, over its wrap."""
+    """Steps between two readings of a counter, across its wrap."""
     return wrapped(now - before)
 
 
 def stop_frames(brake: float, can_id: int | None) -> tuple[bytes, bytes]:
-    """Packets that brake a motor with a current, A, and that let it coast."""
+    """Packets that brake a motor with a current (A), and that let it coast."""
     return frame(forwarded(can_id, set_brake(brake))), frame(forwarded(can_id, set_current(0.0)))

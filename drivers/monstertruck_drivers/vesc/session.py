@@ -1,4 +1,4 @@
-"""Requests and answers, with VESCs over one open link; shared by the driver and `identify`."""
+"""Requests and answers of VESCs over one open link; shared by the driver and `identify`."""
 
 from collections.abc import Callable
 from typing import Final
@@ -22,13 +22,13 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceMismatchError, DeviceTimeoutError, ProtocolError, WrongDeviceError
 
 ATTEMPTS: Final = 3
-"""Tries of the requests of a session's beginning."""
+"""Attempts for each request at the start of a session."""
 SETTINGS_TIMEOUT: Final = 0.5
-"""Timeout of long answers (some 500 bytes) and of those that precede a restart of the applications (s)."""
+"""Timeout of long answers (about 500 bytes) and of requests that restart the applications (s)."""
 
 
 class VescSession:
-    """One session. Packets carry no sequence number: the kind, and for values the CAN id, identify an answer.
+    """One session. Packets carry no sequence number: the kind, and for values also the CAN id, identifies an answer.
 
     Args:
         link: open link.
@@ -41,13 +41,13 @@ class VescSession:
         self.asked = 0
         """Send time of the latest request (ns)."""
         self.heard = False
-        """A whole packet came."""
+        """Whether a complete packet has arrived."""
         self._link = link
         self._clock = clock
         self._timeout = timeout
 
     def send(self, can_id: int | None, payload: bytes) -> None:
-        """Send a payload that is not answered.
+        """Send a payload that has no answer.
 
         Raises:
             DeviceLostError: unplugged.
@@ -55,12 +55,12 @@ class VescSession:
         self._link.write(frame(forwarded(can_id, payload)))
 
     async def identify(self, can_id: int | None) -> FirmwareIdentity:
-        """Return who answers.
+        """Identify a controller.
 
         Raises:
             DeviceLostError: unplugged.
             DeviceTimeoutError: silence.
-            WrongDeviceError: something else answers.
+            WrongDeviceError: another device answers.
             DeviceMismatchError: no controller at the CAN id, or a firmware that is too old.
         """
         who = f"{self._link.name}: "
@@ -85,8 +85,8 @@ class VescSession:
 
         Raises:
             DeviceLostError: unplugged.
-            DeviceTimeoutError: no answer in time.
-            ProtocolError: an answer out of form.
+            DeviceTimeoutError: no answer within the timeout.
+            ProtocolError: a malformed answer.
         """
         until_id = None if can_id is None else lambda payload: MotorValues.of(payload).controller_id == can_id
         try:
@@ -100,13 +100,13 @@ class VescSession:
         """Make a controller brake by itself when set-points stop; its flash is not written.
 
         Returns:
-            Whether it had other settings.
+            Whether the controller had other settings.
 
         Raises:
             DeviceLostError: unplugged.
-            DeviceTimeoutError: no answer in time.
-            DeviceMismatchError: it does not take the setting.
-            ProtocolError: an answer out of form.
+            DeviceTimeoutError: no answer within the timeout.
+            DeviceMismatchError: the controller does not apply the setting.
+            ProtocolError: a malformed answer.
         """
         settings = await self._settings(can_id)
         if _equal(found := self._watchdog(settings), wanted):
@@ -116,7 +116,7 @@ class VescSession:
             await self._ask(can_id, wanted.applied(settings), number, attempts=1, timeout=SETTINGS_TIMEOUT)
             found = self._watchdog(await self._settings(can_id))
         except DeviceTimeoutError:
-            pass  # firmware that knows no temporary settings is silent
+            pass  # firmware without temporary settings does not answer
         if not _equal(found, wanted):
             raise DeviceMismatchError(
                 f"{self._link.name}: its watchdog stays at {found.milliseconds} ms and {found.brake_current:g} A; set "
@@ -148,7 +148,7 @@ class VescSession:
         within = self._timeout if timeout is None else timeout
         for _ in range(attempts):
             if self._link.discard():
-                self.deframer.restart()  # an answer that came late
+                self.deframer.restart()  # an answer that arrived late
             self.asked = self._clock.now()
             self.send(can_id, payload)
             due = self.asked + round(within * SECOND)
@@ -165,7 +165,7 @@ class VescSession:
 
 
 def _equal(found: WatchdogSetting, wanted: WatchdogSetting) -> bool:
-    """Whether settings are the same, as single-precision numbers carry them."""
+    """Whether settings are equal in single precision."""
     close = abs(found.brake_current - wanted.brake_current) < 1e-3 * wanted.brake_current
     return found.milliseconds == wanted.milliseconds and close
 
@@ -178,7 +178,7 @@ async def identify(link: Link, clock: Clock, settings: VescConfig) -> dict[str, 
         ``tachometer``, ``volts``, ``fault``.
 
     Raises:
-        DeviceError: as the driver's ``run``.
+        DeviceError: see the driver's ``run``.
     """
     session = VescSession(link, clock, settings.answer_timeout)
     found = []

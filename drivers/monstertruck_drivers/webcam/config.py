@@ -9,20 +9,20 @@ from monstertruck_schemas.body import LensConfig
 
 
 class WebcamConfig(Schema):
-    """A V4L2 camera that sends motion JPEG; sizes and rates are those the camera offers (``probe`` lists them)."""
+    """A V4L2 camera that sends motion JPEG; the camera must offer the size and rate (``probe`` lists them)."""
 
     kind: Literal["webcam"] = "webcam"
     width: Annotated[int, Field(ge=16, le=4096)] = 640
-    """Pixels"""
+    """Width (pixels)"""
     height: Annotated[int, Field(ge=16, le=4096)] = 480
-    """Pixels"""
+    """Height (pixels)"""
     rate: Annotated[float, Field(gt=0, le=120)] = 15.0
-    """Pictures a second; the camera takes the nearest it has"""
+    """Picture rate (Hz); the camera uses the nearest rate it offers"""
     watchdog: Annotated[float, Field(gt=0, le=60)] = 2.0
-    """Seconds without a whole picture that end the session: a stuck camera reports nothing"""
+    """Time without a complete picture after which the session ends (s): a stuck camera reports no error"""
     buffers: Annotated[int, Field(ge=2, le=32)] = 4
-    """Pictures the kernel may keep for us"""
+    """Number of pictures that the kernel may buffer"""
     frame: FrameId = "camera"
     """Frame of the pictures"""
     lens: LensConfig = LensConfig()
-    """Lens, for measurements by its pictures"""
+    """Lens, for measurements in its pictures"""

@@ -1,4 +1,4 @@
-"""Camera driver: whole pictures become messages, at the camera's own times."""
+"""Camera driver: publishes complete pictures with the camera's own time stamps."""
 
 from typing import Final, Protocol
 
@@ -31,13 +31,13 @@ TABLES_SEGMENT: Final = b"\xff\xc4" + (2 + len(_TABLES)).to_bytes(2, "big") + _T
 def complete(data: bytes) -> bytes:
     """Return the picture from its FF D8 to its FF D9, with Huffman tables.
 
-    Headers are followed; the compressed part is not decoded, so that a flipped bit in it shows in the picture only.
+    The headers are parsed, the compressed data is not: a flipped bit there only changes the picture.
 
     Args:
         data: bytes from the camera; zeros after the picture are cut off.
 
     Raises:
-        ValueError: cut off, or no JPEG; the text says where it ends to be one.
+        ValueError: truncated, or not a JPEG; the text names the position of the error.
     """
     end = data.rfind(END) + len(END)
     if end < len(END) or data[end:].strip(b"\0"):
@@ -64,7 +64,7 @@ def _follow(data: bytes) -> tuple[int, bool]:
 
 
 OLDEST: Final = SECOND
-"""Nanoseconds a picture may have taken to arrive; its stamp is not used beyond."""
+"""Maximum age of a picture at its arrival (ns); an older stamp is not used."""
 
 
 class CameraSettings(Protocol):
@@ -85,14 +85,14 @@ class CameraSettings(Protocol):
 
 
 class WebcamDriver:
-    """Publishes every whole picture.
+    """Publishes every complete picture.
 
     Args:
         config: mode and watchdog.
         source: the camera: ``V4l2Source`` or ``RenderedSource``.
-        clock: time; a real camera's stamps are of CLOCK_MONOTONIC, as the wall clock is.
+        clock: time; a real camera's stamps are times of CLOCK_MONOTONIC, like those of the wall clock.
         out: pictures.
-        events: modes that differ, pictures refused, stamps not used.
+        events: deviating modes, rejected pictures, unused stamps.
         name: service name.
     """
 
@@ -117,15 +117,15 @@ class WebcamDriver:
         self._stamp = -OLDEST
 
     async def run(self, ready: Ready) -> None:
-        """Serve one session; it is ready with its first whole picture.
+        """Serve one session; it is ready after the first complete picture.
 
         Raises:
             DeviceLostError: no camera, or unplugged.
             PortBusyError: another program streams from it.
             DeviceMismatchError: it has no motion JPEG, or refuses the mode.
-            DeviceFaultError: no bandwidth on its hub.
-            DeviceTimeoutError: no picture within the watchdog's time.
-            ProtocolError: pictures, but no whole one within that time.
+            DeviceFaultError: no bandwidth left on its hub.
+            DeviceTimeoutError: no picture within ``watchdog``.
+            ProtocolError: pictures, but no complete one within that time.
         """
         config = self._config
         wanted = Mode(config.width, config.height, config.rate)
@@ -181,7 +181,7 @@ class WebcamDriver:
         return True
 
     def _believed(self, stamp: int | None, received: int) -> int:
-        """The camera's stamp if it can be true, else the time of arrival."""
+        """Return the camera's stamp if it is plausible, otherwise the time of arrival."""
         if stamp is None:
             return received
         possible = max(self._stamp, received - OLDEST) <= stamp <= received

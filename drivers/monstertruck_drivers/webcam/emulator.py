@@ -1,4 +1,4 @@
-"""An emulated camera that shows the world."""
+"""Emulated camera that shows the simulated world."""
 
 import asyncio
 import errno
@@ -21,7 +21,7 @@ from monstertruck_runtime.threads import Offload, in_thread
 
 
 def jpeg(picture: NDArray[np.uint8], counter: int) -> bytes:
-    """A picture, (height, width, 3), with ``counter`` in its upper left corner, as a JPEG."""
+    """Encode a picture of shape (height, width, 3) as JPEG, with ``counter`` in its upper left corner."""
     image = Image.fromarray(picture)
     draw = ImageDraw.Draw(image)
     text = f"{counter:06d}"
@@ -38,7 +38,7 @@ def _font() -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 
 SIZES: Final = ((1600, 1200), (1280, 720), (800, 600), (640, 480), (320, 240), (160, 120))
-"""Sizes offered; like a real driver it grants the nearest one."""
+"""Sizes offered; like a real driver, the emulator grants the nearest one."""
 RATE_MAX: Final = 30.0
 SIGNALS: Final = {
     "image": SignalKind.THING,
@@ -53,12 +53,12 @@ REFUSALS: Final = {"EINVAL": errno.EINVAL, "EBUSY": errno.EBUSY, "ENOSPC": errno
 class WebcamEmulator(FaultyDevice):
     """Camera that streams rendered JPEGs while a host requests them.
 
-    The world is asked on the loop; drawing and compressing happens in ``offload``.
+    The loop reads the world's state; ``offload`` runs drawing and compression.
 
-    Faults (``inject``): ``drop N`` (pictures counted, but not sent), ``corrupt N`` (start marker overwritten),
+    Faults (``inject``): ``drop N`` (pictures are counted, but not sent), ``corrupt N`` (start marker overwritten),
     ``truncate N`` (the second half is missing), ``bare on|off`` (no Huffman tables), ``jump SECONDS`` (added to all
-    stamps from now on), ``stuck on|off`` (streams and answers nothing), ``refuse EINVAL|EBUSY|ENOSPC|off`` (at the
-    next openings), ``vanish [SECONDS]`` (gone from USB in mid-stream, and back).
+    stamps from now on), ``stuck on|off`` (no stream and no answers), ``refuse EINVAL|EBUSY|ENOSPC|off`` (at the
+    next openings), ``vanish [SECONDS]`` (leaves USB while streaming, and returns).
 
     Args:
         clock: time.
@@ -96,7 +96,7 @@ class WebcamEmulator(FaultyDevice):
         self.power_cycle()
 
     def power_cycle(self) -> None:
-        """Supply off and on again: it streams no more, and counts from 0."""
+        """Switch the supply off and on: streaming ends, and the count restarts at 0."""
         self._sequence = 0
         self._session = 0
         self._size = SIZES[0]
@@ -192,5 +192,5 @@ class WebcamEmulator(FaultyDevice):
 
 
 def emulated(setup: EmulatorSetup) -> WebcamEmulator:
-    """The camera of a simulated truck."""
+    """Create the camera of a simulated truck."""
     return WebcamEmulator(setup.clock, setup.physics.view, offload=setup.offload, usb=setup.port)

@@ -1,4 +1,4 @@
-"""Which cameras are there, and what do they offer."""
+"""List the cameras with their formats, sizes and rates."""
 
 from typing import Any
 
@@ -17,11 +17,11 @@ async def identify(
     kernel: Kernel | None = None,
     offload: Offload = in_thread,
 ) -> dict[str, Any]:
-    """Ask every node that fits ``pattern``; nothing is streamed.
+    """Query every node that matches ``pattern``, without streaming.
 
     Returns:
         JSON-able: ``nodes``: path, driver, card, bus, whether it captures, pixel formats, and the sizes and rates of
-        motion JPEG; or why it cannot be asked.
+        motion JPEG; or the error of the query.
     """
     system = kernel or Kernel()
     return await offload(lambda: {"nodes": [_describe(path, system) for path in system.nodes(pattern)]})

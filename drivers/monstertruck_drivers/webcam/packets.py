@@ -1,4 +1,4 @@
-"""Packets of an emulated camera: the answers and pictures that a real camera gives through the kernel.
+"""Packets of an emulated camera: the answers and pictures that the kernel delivers for a real camera.
 
 Host to camera: lines ``OPEN <width> <height> <rate>`` and ``CLOSE``. Camera to host: packets of a header with its
 own CRC-32 and a payload, little-endian.
@@ -28,7 +28,7 @@ class PacketKind(IntEnum):
     REFUSED = 2
     """``number`` is the kernel's error number."""
     PICTURE = 3
-    """``number`` is the camera's count, ``stamp`` the exposure."""
+    """``number`` is the camera's count, ``stamp`` the time of exposure."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,18 +41,18 @@ class CameraPacket:
     payload: bytes = b""
 
     def encode(self) -> bytes:
-        """Bytes on the line."""
+        """Encode the packet."""
         header = _HEADER.pack(MAGIC, self.kind, self.number, self.stamp, len(self.payload))
         return header + _CRC.pack(zlib.crc32(header)) + self.payload
 
 
 def encode_mode(mode: Mode) -> bytes:
-    """Payload of ``GRANTED``."""
+    """Encode the payload of ``GRANTED``."""
     return _MODE.pack(mode.width, mode.height, mode.rate)
 
 
 def decode_mode(payload: bytes) -> Mode:
-    """Mode in the payload of ``GRANTED``.
+    """Decode the payload of ``GRANTED``.
 
     Raises:
         ProtocolError: wrong length.
@@ -63,7 +63,7 @@ def decode_mode(payload: bytes) -> Mode:
 
 
 class PacketParser:
-    """Extracts packets from bytes, however they are cut; after lost bytes it resumes at the next correct header."""
+    """Extracts packets from bytes in chunks of any size; after lost bytes it resumes at the next valid header."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
@@ -71,12 +71,12 @@ class PacketParser:
 
     @property
     def missing(self) -> int:
-        """Bytes without which no further packet can become complete, at least 1."""
+        """Number of bytes needed to complete the next packet, at least 1."""
         whole = HEADER_SIZE if self._header is None else self._header[3]
         return max(whole - len(self._buffer), 1)
 
     def feed(self, data: bytes) -> list[CameraPacket]:
-        """Everything that became complete, in order."""
+        """Return the completed packets, in order."""
         self._buffer += data
         packets: list[CameraPacket] = []
         while (packet := self._next()) is not None:

@@ -1,6 +1,6 @@
-"""Video4Linux2 in as much as a capturing motion-JPEG camera needs: structures and requests.
+"""Structures and requests of Video4Linux2 that a motion-JPEG camera needs.
 
-Structures are laid out by ``struct`` in the machine's own sizes and alignment, as the kernel's header has them.
+``struct`` lays the structures out with native sizes and alignment, as in the kernel's header.
 Source: kernel documentation, userspace-api/media/v4l, and include/uapi/linux/videodev2.h.
 """
 
@@ -72,12 +72,12 @@ class Capability:
 
     @property
     def captures(self) -> bool:
-        """Whether pictures can be streamed from the node; false for a camera's second, metadata node."""
+        """Whether the node can stream pictures; false for a camera's second node, which carries metadata."""
         return self.flags & (CAP_CAPTURE | CAP_STREAMING) == CAP_CAPTURE | CAP_STREAMING
 
     @classmethod
     def unpack(cls, data: Bytes) -> "Capability":
-        """Read the kernel's structure."""
+        """Unpack the kernel's structure."""
         driver, card, bus, _, whole, node, *_ = CAPABILITY.unpack(data)
         return cls(_text(driver), _text(card), _text(bus), node if whole & CAP_DEVICE_CAPS else whole)
 
@@ -88,10 +88,10 @@ class Filled:
 
     index: int
     used: int
-    """Bytes of the picture."""
+    """Size of the picture (bytes)."""
     flags: int
     stamp: int | None
-    """Nanoseconds of CLOCK_MONOTONIC; None: of another clock."""
+    """Time stamp on CLOCK_MONOTONIC (ns); None if it uses another clock."""
     sequence: int
     offset: int
     """Offset for mapping the buffer."""
@@ -99,7 +99,7 @@ class Filled:
 
     @classmethod
     def unpack(cls, data: Bytes) -> "Filled":
-        """Read the kernel's structure."""
+        """Unpack the kernel's structure."""
         index, _, used, flags, _, seconds, micros, *_, sequence, _, offset, length, _, _ = BUFFER.unpack(data)
         monotonic = flags & 0xE000 == TIMESTAMP_MONOTONIC  # bits of the clock of its stamps
         stamp = seconds * SECOND + micros * 1000 if monotonic else None
@@ -117,7 +117,7 @@ def format_request(mode: Mode) -> bytearray:
 
 
 def format_granted(data: Bytes) -> tuple[int, int, int]:
-    """Width, height and pixel format the driver chose."""
+    """Width, height and pixel format that the driver granted."""
     _, width, height, pixel_format, *_ = FORMAT.unpack(data)
     return width, height, pixel_format
 
@@ -128,7 +128,7 @@ def rate_request(rate: float) -> bytearray:
 
 
 def rate_granted(data: Bytes, asked: float) -> float:
-    """Rate the driver chose; ``asked`` where it cannot be set."""
+    """Rate that the driver granted; ``asked`` if the rate cannot be set."""
     _, _, _, numerator, denominator, _ = STREAM_PARAMETERS.unpack(data)
     return denominator / numerator if numerator and denominator else asked
 

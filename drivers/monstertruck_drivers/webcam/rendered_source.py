@@ -12,11 +12,11 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import DeviceTimeoutError
 
 MOST: Final = BUFFER_LIMIT // 2
-"""Bytes of a picture taken at a time: the link keeps no more than its buffer holds."""
+"""Maximum size of a picture read at once (bytes): the link's buffer holds no more."""
 
 
 class RenderedSource:
-    """A camera whose ``WebcamEmulator`` runs at the other end of ``port``: in this process or in another.
+    """Camera whose ``WebcamEmulator`` runs at the other end of ``port``, in this process or another one.
 
     Args:
         port: memory port or pty.
@@ -45,7 +45,7 @@ class RenderedSource:
             raise
 
     async def _answer(self, link: Link, parser: PacketParser) -> Mode:
-        """Wait for it; pictures of an earlier session are dropped."""
+        """Wait for the answer; pictures of an earlier session are dropped."""
         while True:
             for packet in parser.feed(await link.exactly(min(parser.missing, MOST))):
                 if packet.kind is PacketKind.GRANTED:
@@ -56,7 +56,7 @@ class RenderedSource:
 
 
 class RenderedStream:
-    """Latest picture of a streaming emulator."""
+    """Stream of an emulated camera."""
 
     def __init__(self, link: Link, parser: PacketParser, mode: Mode) -> None:
         self.mode = mode
@@ -85,7 +85,7 @@ PTYS: Final = Path("/dev/pts")
 
 
 class PathSource:
-    """Checks at every opening whether the path leads to a pty, which only an emulator can serve.
+    """Camera at a path; each opening checks whether the path leads to a pty, which only an emulator serves.
 
     Args:
         path: node, symlink or glob pattern, see ``V4l2Source``.

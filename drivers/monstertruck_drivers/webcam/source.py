@@ -16,12 +16,12 @@ from monstertruck_runtime.errors import (
 
 @dataclass(frozen=True, slots=True)
 class Mode:
-    """The settings requested of a camera, or those that it granted."""
+    """Settings requested of a camera, or granted by it."""
 
     width: int
     height: int
     rate: float
-    """Pictures a second."""
+    """Picture rate (Hz)."""
 
     def __str__(self) -> str:
         return f"{self.width}x{self.height} at {self.rate:g} Hz"
@@ -29,25 +29,25 @@ class Mode:
 
 @dataclass(frozen=True, slots=True)
 class CameraFrame:
-    """One picture as the camera gave it: not checked yet."""
+    """One picture as the camera sent it, still unchecked."""
 
     stamp: int | None
     """Time of exposure on CLOCK_MONOTONIC (ns); None: unknown."""
     sequence: int
-    """The camera's own count."""
+    """Picture count of the camera."""
     data: bytes
     damaged: bool = False
     """The kernel marked the picture as incomplete."""
 
 
 class FrameStream(Protocol):
-    """A camera that is sending."""
+    """Stream of a camera."""
 
     mode: Mode
     """Granted mode; it may differ from the requested one."""
 
     async def next(self) -> CameraFrame:
-        """Wait for a picture newer than the last one; those in between are dropped.
+        """Wait for a picture newer than the last one; older pictures are dropped.
 
         Raises:
             DeviceLostError: unplugged.
@@ -55,14 +55,14 @@ class FrameStream(Protocol):
         """
 
     async def __aenter__(self) -> Self:
-        """The stream itself."""
+        """Return the stream itself."""
 
     async def __aexit__(self, *_: object) -> None:
         """Stop and release the camera."""
 
 
 class FrameSource(Protocol):
-    """Somewhere a camera may be plugged in."""
+    """Place that a camera may be plugged into."""
 
     name: str
 
@@ -70,11 +70,11 @@ class FrameSource(Protocol):
         """Start the camera.
 
         Raises:
-            DeviceLostError: none is plugged in.
+            DeviceLostError: no camera is plugged in.
             PortBusyError: another program streams from it.
             DeviceMismatchError: it has no motion JPEG, or refuses the mode.
-            DeviceFaultError: no bandwidth on its hub.
-            DeviceError: it failed otherwise.
+            DeviceFaultError: no bandwidth left on its hub.
+            DeviceError: any other failure.
         """
 
 

@@ -1,4 +1,4 @@
-"""The real camera: finds its node, sets it up, and takes pictures from the kernel's buffers."""
+"""Real camera: finds its node, sets it up, and reads pictures from the kernel's buffers."""
 
 import asyncio
 import contextlib
@@ -20,42 +20,42 @@ from monstertruck_runtime.errors import DeviceError, DeviceLostError, DeviceMism
 from monstertruck_runtime.threads import Offload, in_daemon_thread
 
 CAMERA_STOP_LIMIT: Final = 2.0
-"""Longest wait for the camera to stop at the end of a session (s)."""
+"""Maximum wait for the camera to stop at the end of a session (s)."""
 
 
 class Kernel:
-    """The system calls a camera is used through; every one of them may block."""
+    """System calls for a camera; each of them may block."""
 
     def nodes(self, pattern: str) -> list[str]:
-        """Existing device nodes that fit a glob pattern, video2 before video10."""
+        """Existing device nodes that match a glob pattern, video2 before video10."""
         return sorted(map(str, Path("/").glob(pattern.lstrip("/"))), key=lambda path: (len(path), path))
 
     def open(self, path: str) -> int:
-        """Open without blocking later reads; raises ``OSError``."""
+        """Open a node without blocking later reads; raises ``OSError``."""
         return os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
 
     def close(self, fd: int) -> None:
-        """Close."""
+        """Close a node."""
         os.close(fd)
 
     def ioctl(self, fd: int, request: int, argument: bytearray) -> None:
-        """Carry out a request; ``argument`` is changed in place. Raises ``OSError``."""
+        """Execute a request; ``argument`` is changed in place. Raises ``OSError``."""
         fcntl.ioctl(fd, request, argument, True)
 
     def map(self, fd: int, length: int, offset: int) -> mmap:
-        """Map a buffer, to read it; raises ``OSError``."""
+        """Map a buffer for reading; raises ``OSError``."""
         return mmap(fd, length, MAP_SHARED, PROT_READ, offset=offset)
 
 
 class V4l2Source:
-    """A camera by its device node.
+    """Camera at a device node.
 
     Args:
         pattern: node, symlink or glob pattern, such as ``/dev/v4l/by-path/*usb-0:1.2:1.0-video-index*``. A camera has
-            several nodes; of those that fit, the first one that captures motion JPEG is taken.
+            several nodes; the first matching one that captures motion JPEG is used.
         kernel: system calls.
-        offload: where setting up and letting go is done: control transfers over USB take tens of milliseconds, and 5 s
-            each where the camera does not answer.
+        offload: runs set-up and release: control transfers over USB take tens of milliseconds, and 5 s each if the
+            camera does not answer.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class Camera:
 
     @classmethod
     def start(cls, pattern: str, kernel: Kernel, mode: Mode, buffers: int) -> "Camera":
-        """Open the node that captures motion JPEG and let it stream."""
+        """Open the node that captures motion JPEG and start streaming."""
         path = find_node(pattern, kernel)
         with _doing(path, "open it"):
             camera = cls(path, kernel, kernel.open(path))
@@ -102,7 +102,7 @@ class Camera:
         return camera
 
     def take(self) -> CameraFrame | None:
-        """The oldest picture that is ready, if any; its buffer goes back to the kernel.
+        """Return the oldest picture that is ready, if any; its buffer returns to the kernel.
 
         Raises:
             DeviceLostError: unplugged.
@@ -120,7 +120,7 @@ class Camera:
         return CameraFrame(filled.stamp, filled.sequence, data, damaged=bool(filled.flags & v4l2.FLAG_ERROR))
 
     def stop(self) -> None:
-        """Stop streaming, unmap and close; a camera that is gone is let go just the same."""
+        """Stop streaming, unmap and close; also releases a camera that has vanished."""
         with contextlib.suppress(OSError):
             self._kernel.ioctl(self.fd, v4l2.STREAMOFF, bytearray(v4l2.NUMBER.pack(v4l2.CAPTURE)))
         for memory in self._memory:
@@ -140,7 +140,7 @@ class Camera:
         try:
             self._kernel.ioctl(self.fd, v4l2.S_PARM, rate)
         except OSError as error:
-            if error.errno not in (errno.EINVAL, errno.ENOTTY):  # a camera of one fixed rate
+            if error.errno not in (errno.EINVAL, errno.ENOTTY):  # camera with a fixed rate
                 raise device_error(self.path, "set the rate", error) from error
         self.mode = Mode(width, height, v4l2.rate_granted(rate, mode.rate))
 
@@ -158,13 +158,13 @@ class Camera:
 
 
 class _Starting:
-    """Start of a camera that its caller may give up before the kernel has completed it.
+    """Start of a camera that the caller may abandon before the kernel has completed it.
 
     Args:
         pattern: see ``V4l2Source``.
         kernel: system calls.
-        mode: wanted.
-        buffers: how many.
+        mode: requested mode.
+        buffers: number of buffers.
     """
 
     def __init__(self, pattern: str, kernel: Kernel, mode: Mode, buffers: int) -> None:
@@ -174,7 +174,7 @@ class _Starting:
         self._camera: Camera | None = None
 
     def run(self) -> Camera:
-        """Start it; blocks."""
+        """Start the camera; blocks."""
         camera = self._start()
         with self._lock:
             self._camera = camera
@@ -183,7 +183,7 @@ class _Starting:
         return camera
 
     def give_up(self) -> None:
-        """Let the camera go, now or as soon as it has started."""
+        """Release the camera, now or as soon as it has started."""
         with self._lock:
             self._is_given_up = True
             if self._camera is not None:
@@ -191,7 +191,7 @@ class _Starting:
 
 
 class V4l2Stream:
-    """Latest picture of a streaming camera."""
+    """Stream of a real camera."""
 
     def __init__(self, camera: Camera, offload: Offload) -> None:
         self.mode = camera.mode
@@ -217,7 +217,7 @@ class V4l2Stream:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Let the camera go; waits only briefly for one that does not answer the kernel."""
+        """Release the camera; waits only briefly if it does not answer the kernel."""
         self._loop.remove_reader(self._camera.fd)
         stopping = asyncio.ensure_future(self._offload(self._camera.stop))
         try:
@@ -229,7 +229,7 @@ class V4l2Stream:
         try:
             frame = self._camera.take()
         except DeviceError as error:
-            # The node stays readable forever now.
+            # The node remains readable forever after this.
             self._loop.remove_reader(self._camera.fd)
             self._error = error
             self._news.set()
@@ -240,12 +240,12 @@ class V4l2Stream:
 
 
 def find_node(pattern: str, kernel: Kernel) -> str:
-    """The first node of ``pattern`` that captures motion JPEG.
+    """Return the first node of ``pattern`` that captures motion JPEG.
 
     Raises:
         DeviceLostError: there is no such node.
-        DeviceMismatchError: nodes fit, but none captures motion JPEG.
-        DeviceError: a node cannot be asked.
+        DeviceMismatchError: nodes match, but none captures motion JPEG.
+        DeviceError: a node cannot be queried.
     """
     paths = kernel.nodes(pattern)
     if not paths:
@@ -261,10 +261,10 @@ def find_node(pattern: str, kernel: Kernel) -> str:
 
 
 def pixel_formats(path: str, kernel: Kernel) -> list[int]:
-    """Pixel formats a node can capture; none if it does not capture.
+    """Return the pixel formats that a node can capture; empty if it does not capture.
 
     Raises:
-        DeviceError: it cannot be asked.
+        DeviceError: the node cannot be queried.
     """
     with asked(path, kernel) as (fd, capability):
         return enumerate_formats(fd, kernel) if capability.captures else []
@@ -284,13 +284,13 @@ def asked(path: str, kernel: Kernel) -> Iterator[tuple[int, v4l2.Capability]]:
 
 
 def enumerate_formats(fd: int, kernel: Kernel) -> list[int]:
-    """Pixel formats an open node can capture."""
+    """Return the pixel formats that an open node can capture."""
     rows = _enumerate(fd, kernel, v4l2.ENUM_FMT, v4l2.FORMAT_DESCRIPTION, v4l2.CAPTURE)
     return [int(row[4]) for row in rows]
 
 
 def enumerate_modes(fd: int, kernel: Kernel) -> list[Mode]:
-    """Discrete sizes and rates of motion JPEG; stepwise ones are left out."""
+    """Return the discrete sizes and rates of motion JPEG; stepwise ones are omitted."""
     modes = []
     for _, _, size_kind, width, height, *_ in _enumerate(fd, kernel, v4l2.ENUM_FRAMESIZES, v4l2.FRAME_SIZE, v4l2.MJPG):
         if size_kind != v4l2.DISCRETE:
@@ -305,10 +305,10 @@ def enumerate_modes(fd: int, kernel: Kernel) -> list[Mode]:
 
 
 def _enumerate(fd: int, kernel: Kernel, request: int, layout: struct.Struct, *key: int) -> list[tuple[Any, ...]]:
-    """Rows of an enumeration: index and key go in first, the whole structure comes back."""
+    """Return the rows of an enumeration; each request contains index and key and returns the whole structure."""
     head = struct.Struct(f"@{1 + len(key)}I")
     rows: list[tuple[Any, ...]] = []
-    while len(rows) < 256:  # rows at most: a broken driver may never say that there are no more
+    while len(rows) < 256:  # maximum number of rows: a broken driver may never report the end
         argument = bytearray(layout.size)
         head.pack_into(argument, 0, len(rows), *key)
         try:
@@ -323,7 +323,7 @@ def _enumerate(fd: int, kernel: Kernel, request: int, layout: struct.Struct, *ke
 
 @contextmanager
 def _doing(path: str, what: str) -> Iterator[None]:
-    """Turn the kernel's errors into ours; "nothing there yet" passes."""
+    """Convert the kernel's errors into ``DeviceError``; "nothing there yet" is not an error."""
     try:
         yield
     except BlockingIOError:

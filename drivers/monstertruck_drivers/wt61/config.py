@@ -13,12 +13,12 @@ class Wt61Config(Schema):
 
     kind: Literal["wt61"] = "wt61"
     average: Annotated[int, Field(ge=1, le=20)] = 2
-    """Measurements averaged in one message; the unit takes 100 a second"""
+    """Number of measurements averaged in one message; the unit measures at 100 Hz"""
     delay: Annotated[float, Field(ge=0, le=0.5)] = 0.008
     """Age of a measurement when its last byte arrives (s): 33 bytes and the unit's filter"""
     silence: Annotated[float, Field(gt=0, le=10)] = 0.3
-    """Seconds without a measurement that end the session"""
+    """Time without a measurement after which the session ends (s)"""
     stuck_after: Annotated[int, Field(ge=2, le=10_000)] = 50
-    """Measurements that are equal to the last bit, in a row, that end the session: sensors are never so quiet"""
+    """Number of consecutive identical measurements after which the session ends: real sensors have noise"""
     correction: ImuCorrection = ImuCorrection()
     """Biases and scale of this unit"""

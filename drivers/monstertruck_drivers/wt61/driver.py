@@ -21,7 +21,7 @@ class ImuSample(NamedTuple):
 
 
 class Wt61Session:
-    """Listening to one unit.
+    """Receives from one unit.
 
     Args:
         link: open link.
@@ -35,7 +35,7 @@ class Wt61Session:
         self._acceleration: Wt61Packet | None = None
 
     async def receive(self, within: float) -> list[ImuSample]:
-        """Return samples that became complete; raises as ``DeviceStream.receive``."""
+        """Return samples that became complete; raises the errors of ``DeviceStream.receive``."""
         return await self._stream.receive(within)
 
     def _samples(self, packets: list[Wt61Packet]) -> list[ImuSample]:
@@ -53,8 +53,8 @@ class Wt61Session:
 
         Raises:
             DeviceLostError: unplugged.
-            DeviceTimeoutError: silence to the end.
-            WrongDeviceError: bytes, but none of a WT61.
+            DeviceTimeoutError: silence.
+            WrongDeviceError: bytes, but no packet of a WT61.
         """
         for remedy in (b"", TOGGLE_SLEEP):
             if remedy:
@@ -68,7 +68,7 @@ class Wt61Session:
 
 
 class Wt61Driver:
-    """Listens; a unit that is silent is woken up once.
+    """Receives the unit's stream; a silent unit is woken up once.
 
     Args:
         config: averaging and checks.
@@ -100,8 +100,8 @@ class Wt61Driver:
         Raises:
             DeviceLostError: unplugged.
             DeviceTimeoutError: silence.
-            ProtocolError: bytes without a measurement, or the same measurement again and again.
-            WrongDeviceError: nothing that comes at the start is of a WT61.
+            ProtocolError: bytes without a measurement, or a repeated measurement.
+            WrongDeviceError: the bytes at the start contain no packet of a WT61.
             PortBusyError: another process holds the port.
         """
         async with await self._port.open() as link:
@@ -146,7 +146,7 @@ async def identify(link: Link, clock: Clock, settings: Wt61Config) -> dict[str, 
         JSON-able: ``angular_velocity`` (rad/s), ``acceleration`` (m/s^2), ``temperature_c``.
 
     Raises:
-        DeviceError: as the driver's ``run``.
+        DeviceError: see the driver's ``run``.
     """
     force, rate = (await Wt61Session(link, clock).start())[-1]
     return {

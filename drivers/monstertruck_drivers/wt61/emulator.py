@@ -1,4 +1,4 @@
-"""The device side of a WT61, byte for byte."""
+"""Device side of a WT61, byte for byte."""
 
 import asyncio
 from typing import Final
@@ -16,15 +16,15 @@ REPORTED: Final = (
     *(f"{kind.name.lower()}_{axis}" for kind in (Wt61Kind.ACCELERATION, Wt61Kind.ANGULAR_VELOCITY) for axis in "xyz"),
     "temperature",
 )
-"""Numbers of its packets, in their own counts."""
+"""Numbers in its packets, as raw counts."""
 SLEEP: Final = "toggle_sleep"
 
 
 class Wt61Emulator(FaultyDevice):
-    """WT61 that streams from power-up on.
+    """WT61 that streams from power-up.
 
     Faults (`inject`): ``frozen on|off`` (repeats the same packets), ``silent on|off``, ``asleep on|off``
-    (standby, which the command for it ends), ``bad_checksum N`` (the next N packets), ``inverted on|off``
+    (standby, until the standby command), ``bad_checksum N`` (the next N packets), ``inverted on|off``
     (mounted upside down: yaw rate with the wrong sign), ``half_packet``.
 
     Args:
@@ -54,7 +54,7 @@ class Wt61Emulator(FaultyDevice):
         self._awake_at = 0
 
     async def run(self, end: DeviceEnd) -> None:
-        """DeviceStream, and take commands."""
+        """Stream packets and execute commands."""
         end.baud = WT61_BAUD
         end.on_plug = lambda plugged: self.power_cycle() if plugged else None  # the port is its supply
         self.power_cycle()
@@ -69,7 +69,7 @@ class Wt61Emulator(FaultyDevice):
         self.faults["asleep"] = not self.faults["asleep"]
 
     def power_cycle(self) -> None:
-        """Cycle the power, which wakes the sensor up."""
+        """Switch the supply off and on, which wakes the unit up."""
         self.faults["asleep"] = False
         self.faults["half_packet"] = 1
         self._awake_at = self._clock.now() + 300_000_000  # nanoseconds from power-up to the first packet
@@ -116,5 +116,5 @@ def _count(value: int) -> int:
 
 
 def emulated(setup: EmulatorSetup) -> Wt61Emulator:
-    """The IMU of a simulated robot."""
+    """Create the IMU of a simulated robot."""
     return Wt61Emulator(setup.clock, setup.physics.imu, seed=setup.seed)

@@ -14,11 +14,11 @@ from monstertruck_schemas.sensor import STANDARD_GRAVITY
 
 WT61_BAUD: Final = 115200
 RATE: Final = 100
-"""Triples of packets a second at this baud rate."""
+"""Packet triples per second at this baud rate."""
 HEADER: Final = 0x55
 WT61_SIZE: Final = 11
 TOGGLE_SLEEP: Final = b"\xff\xaa\x60"
-"""Standby and back."""
+"""Command that enters or leaves standby."""
 _BODY: Final = struct.Struct("<BB4h")
 _ACCELERATION: Final = 16 * STANDARD_GRAVITY / 32768
 _RATE: Final = radians(2000) / 32768
@@ -47,12 +47,12 @@ class Wt61Packet(NamedTuple):
 
     @property
     def acceleration(self) -> Xyz:
-        """m/s^2."""
+        """Specific force (m/s^2)."""
         return self.x * _ACCELERATION, self.y * _ACCELERATION, self.z * _ACCELERATION
 
     @property
     def angular_velocity(self) -> Xyz:
-        """rad/s."""
+        """Angular velocity (rad/s)."""
         return self.x * _RATE, self.y * _RATE, self.z * _RATE
 
     @property
@@ -62,7 +62,7 @@ class Wt61Packet(NamedTuple):
 
 
 def build(packet: Wt61Packet) -> bytes:
-    """Bytes of a packet.
+    """Encode a packet.
 
     Raises:
         struct.error: a number beyond 16 bits.
@@ -72,21 +72,21 @@ def build(packet: Wt61Packet) -> bytes:
 
 
 def measured(kind: Wt61Kind, vector: Xyz, celsius: float) -> Wt61Packet:
-    """Packet of a measurement in SI units, clipped to the unit's range."""
+    """Return the packet of a measurement in SI units, clipped to the unit's range."""
     unit = _ACCELERATION if kind is Wt61Kind.ACCELERATION else _RATE
     x, y, z = (max(-_MOST, min(_MOST, round(value / unit))) for value in vector)
     return Wt61Packet(kind, x, y, z, round((celsius - 36.53) * 340))
 
 
 class Wt61Parser:
-    """Collects bytes to packets; counts the bytes that belong to none."""
+    """Extracts packets from bytes; counts the bytes outside of packets."""
 
     def __init__(self) -> None:
         self.refused = 0
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> list[Wt61Packet]:
-        """Packets that became complete."""
+        """Return the completed packets."""
         self._buffer += data
         packets = []
         while (packet := self._next()) is not None:

@@ -10,20 +10,20 @@ RPM = 2 * pi / 60
 
 
 class Shaft:
-    """Motor under a speed controller: ramped demand, first-order lag behind it; sign: forwards positive."""
+    """Motor under a speed controller: ramped demand followed by a first-order lag; forward positive."""
 
     def __init__(self, config: MotorConfig) -> None:
         self._config = config
         self.target: float | None = None
-        """Speed that it ramps towards (rpm); None: the power stage is off."""
+        """Speed at the end of the ramp (rpm); None: the power stage is off."""
         self._acceleration = 0.0
         self.turns = 0.0
         self.rpm = 0.0
         self.demand_rpm = 0.0
         self.slope = 0.0
-        """Present acceleration, rpm/s."""
+        """Current acceleration (rpm/s)."""
         self.blocked = False
-        """Something holds it, whatever the motor does."""
+        """Whether the shaft is held, whatever the motor does."""
 
     def command(self, target_rpm: float | None, accel_rpm_s: float) -> None:
         """Ramp towards a speed; None switches the power stage off."""
@@ -38,7 +38,7 @@ class Shaft:
         return self.target is not None
 
     def step(self, dt: float) -> None:
-        """Move on by dt seconds."""
+        """Advance by ``dt`` seconds."""
         before = self.rpm
         if self.target is None:
             self.demand_rpm = 0.0
@@ -56,7 +56,7 @@ class Shaft:
 
 
 class Servo:
-    """A hobby servo: measures its pulse in steps, ignores small changes, turns late and at a limited rate.
+    """Hobby servo: quantises its pulse, ignores small changes, and turns with a delay and at a limited rate.
 
     It is limp without pulses.
 
@@ -70,16 +70,16 @@ class Servo:
         self._right_stop = -radians(config.right_stop_deg)
         self._held_us: float | None = None
         self._target = 0.0
-        """Angle that the arm turns to (rad)."""
+        """Target angle of the arm (rad)."""
         self._elapsed = 0.0
-        """s."""
+        """Elapsed time (s)."""
         self._due: deque[tuple[float, float]] = deque()
-        """When (s) the angles (rad) of newer pulses become the target."""
+        """Times (s) at which the angles (rad) of newer pulses become the target."""
         self.angle = 0.0
         """Angle of the arm (rad)."""
 
     def latch(self, pulse_us: float | None) -> None:
-        """Take over one pulse; None (no pulses) leaves the arm where it is."""
+        """Process one pulse; without pulses (None) the arm stays in place."""
         if pulse_us is None:
             self._held_us = None
             return
@@ -91,7 +91,7 @@ class Servo:
             self._due.append((self._elapsed + self._config.dead_time, target))
 
     def step(self, dt: float) -> None:
-        """Turn towards the held pulse for dt seconds."""
+        """Turn towards the target for ``dt`` seconds."""
         end = self._elapsed + dt
         while self._due and self._due[0][0] < end - 1e-9:
             at, target = self._due.popleft()

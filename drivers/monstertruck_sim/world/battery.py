@@ -1,4 +1,4 @@
-"""LiPo pack: coulomb counting, immediate and slow sag, read through a divider and an RC filter."""
+"""LiPo pack: coulomb counting, fast and slow sag, measured through a divider and an RC filter."""
 
 from math import exp
 
@@ -9,7 +9,7 @@ _CELL_VOLTS: list[float] = CELL_VOLTS.tolist()
 
 
 def rest_voltage(charge: float, cells: int) -> float:
-    """Open-circuit volts of cells in series at a charge of 0..1 (the table in common circulation, 5 % steps)."""
+    """Return the open-circuit voltage of a pack at a charge of 0..1 (widely used table, 5 % steps)."""
     steps = len(_CELL_VOLTS) - 1
     place = min(max(charge, 0.0), 1.0) * steps
     below = min(int(place), steps - 1)
@@ -18,7 +18,7 @@ def rest_voltage(charge: float, cells: int) -> float:
 
 
 class BatteryModel:
-    """The pack's state; ``step`` moves it on.
+    """State of the pack; ``step`` advances it.
 
     Args:
         config: parameters and initial charge.
@@ -30,19 +30,19 @@ class BatteryModel:
         self.current = 0.0
         """Current into the pack (A)."""
         self.connected = True
-        """Its plug is in."""
+        """Whether the pack is plugged in."""
         self.set_charge(config.charge)
         self._filtered = self.volts
 
     def set_charge(self, charge: float) -> None:
-        """Replace the pack by one with another charge, 0..1."""
+        """Replace the pack with one at another charge, 0..1."""
         self.charge = charge
         self._rest = rest_voltage(charge, self._config.cells)
         self.volts = self._loaded(self._config.electronics_w / self._rest)
 
     @property
     def analog_volts(self) -> float:
-        """Behind divider and filter."""
+        """Voltage after divider and filter."""
         return self._filtered / self._config.divider + self._config.analog_offset
 
     def step(self, dt: float, motor_w: float, charger_a: float = 0.0) -> None:
@@ -63,5 +63,5 @@ class BatteryModel:
 
 
 def _share(dt: float, time_constant: float) -> float:
-    """Part of a step response after dt."""
+    """Fraction of a step response reached after ``dt``."""
     return 1.0 - exp(-dt / time_constant)

@@ -17,7 +17,7 @@ class BoardHolder:
     """A person who holds a board in front of a camera and changes its pose at intervals.
 
     Args:
-        board: the board, and for how long each pose is held.
+        board: the board, and the duration of each pose.
         field_of_view: field of view of the camera (rad).
         seed: seed of the board poses.
 
@@ -30,13 +30,13 @@ class BoardHolder:
         self._board, self._field_of_view, self._seed = board, field_of_view, seed
 
     def panel_at(self, time_ns: int, place: CameraPlace) -> FlatPanel:
-        """Return the board at an instant, in front of a camera that is then at ``place``."""
+        """Return the board at a time, in front of a camera that is then at ``place``."""
         slot = time_ns // round(self._board.hold * SECOND)
         return held(self._board, place, generator(self._seed, BOARD, slot), self._field_of_view)
 
 
 def held(board: HeldBoard, place: CameraPlace, rng: np.random.Generator, field_of_view: float) -> FlatPanel:
-    """Return the board at a random place in a camera's view, turned by up to 30 degrees and leaning by 17 to 40."""
+    """Return the board at a random position in the view, rotated by up to 30 degrees and tilted by 17 to 40."""
     texture = board_texture(board.columns, board.rows, board.square, board.marker)
     wide, high = (printed * board.printed_scale for printed in (board.width, board.height))
     away = rng.uniform(0.9, 1.7) * max(wide, high) / math.tan(field_of_view / 2)

@@ -19,7 +19,7 @@ from monstertruck_runtime.map_files import FREE, OCCUPIED, UNKNOWN, WorldMap, sa
 from monstertruck_sim.world.terrain import Profile, profile_path, save_profile
 
 DRAWN_RESOLUTION = 0.025
-"""m per cell."""
+"""Resolution of the drawn maps (m/cell)."""
 _WALL = 0.1
 
 
@@ -31,7 +31,7 @@ class RoundedRectangle(NamedTuple):
     radius: float
 
     def distances(self, canvas: "_Canvas") -> Array:
-        """Distance of every cell from the lap's inner straight core, minus the radius (m): 0 on the lap."""
+        """Distance of every cell from the lap (m): 0 on the lap, negative inside."""
         dx = np.maximum(abs(canvas.xs) - (self.length / 2 - self.radius), 0)
         dy = np.maximum(abs(canvas.ys) - (self.width / 2 - self.radius), 0)
         away: Array = np.hypot(dx, dy) - self.radius
@@ -45,7 +45,7 @@ CIRCUIT = RoundedRectangle(9.0, 6.4, 2.5)
 
 
 def _widened(cells: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
-    """Cells with a set one within ``by`` rows and columns."""
+    """Return the cells that have a set cell within ``by`` rows and columns."""
     for axis in range(cells.ndim):
         around = np.pad(cells, [(by, by) if axis == other else (0, 0) for other in range(cells.ndim)])
         cells = np.asarray(sliding_window_view(around, 2 * by + 1, axis).any(axis=-1))
@@ -54,7 +54,7 @@ def _widened(cells: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, slots=True)
 class BuiltIn:
-    """A world: map, start pose (x, y, yaw) and the ground's profile where it is not level."""
+    """A world: map, start pose (x, y, yaw) and the ground profile if it is not level."""
 
     map: WorldMap
     start: tuple[float, float, float]
@@ -62,7 +62,7 @@ class BuiltIn:
 
 
 class _Canvas:
-    """Free space on solid rock, drawn in metres; finally only a skin of the rock is kept as wall.
+    """Map canvas in metres: free space is cut out of solid cells, of which only a thin layer finally remains as wall.
 
     Args:
         x: lower and upper bound (m).
@@ -93,9 +93,9 @@ class _Canvas:
 
 
 def loop() -> BuiltIn:
-    """A corridor 1.2 m wide round a block, with niches, posts and boxes for the scan to hold on to."""
+    """A corridor 1.2 m wide around a block, with niches, posts and boxes as features for scan matching."""
     canvas = _Canvas((-3.4, 3.4), (-2.8, 2.8))
-    # Inside the straight core the distance to the rounded rectangle does not matter: the block stands there.
+    # Inside the straight core the distance to the rounded rectangle is irrelevant: the block is there.
     canvas.free = abs(LOOP.distances(canvas)) < 1.2 / 2  # width of the corridor, m
     for niche in ((1.6, 2.2, 2.9, 2.45), (-1.3, 2.2, -0.4, 2.5), (-0.2, -2.6, 0.5, -2.2), (2.8, -0.5, 3.2, 0.2)):
         canvas.free |= canvas.rectangle(*niche)
@@ -109,7 +109,7 @@ def loop() -> BuiltIn:
 
 
 def circuit() -> BuiltIn:
-    """A track 2.2 m wide round a block, for fast robots, with niches, boxes and posts along its walls."""
+    """A track 2.2 m wide around a block, for fast robots, with niches, boxes and posts along its walls."""
     canvas = _Canvas((-6.2, 6.2), (-4.9, 4.9))
     canvas.free = abs(CIRCUIT.distances(canvas)) < 2.2 / 2  # width of the track, m
     for niche in ((2.0, 4.2, 2.8, 4.6), (-1.8, 4.2, -0.8, 4.7), (-0.4, -4.6, 0.6, -4.2), (5.5, -0.6, 5.9, 0.5)):
@@ -204,7 +204,7 @@ def workshop() -> BuiltIn:
 
 
 def table() -> BuiltIn:
-    """The flat top of a test stand with a rim all around; its middle is the origin."""
+    """The flat top of a test stand with a rim all around; the origin is its centre."""
     half = 3.0 / 2  # side of the test stand's table, m
     canvas = _Canvas((-half - _WALL, half + _WALL), (-half - _WALL, half + _WALL))
     canvas.free |= canvas.rectangle(-half, -half, half, half)
@@ -225,7 +225,7 @@ BUILT_IN: dict[str, Callable[[], BuiltIn]] = {
 
 
 def lap(shape: RoundedRectangle = LOOP, spacing: float = 0.05) -> Array:
-    """The drawn lap of a world, counter-clockwise from its start pose and back to it.
+    """Return the lap of a world, counter-clockwise from its start pose and back to it.
 
     Args:
         shape: shape of the lap.

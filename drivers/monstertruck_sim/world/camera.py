@@ -1,4 +1,4 @@
-"""View of the truck's camera in the plane: walls as columns, tags and people as flat panels, through a lens.
+"""View of the truck's camera for the plane engine: walls as columns, tags and people as flat panels, through a lens.
 
 A pixel's ray follows the camera's true lens (Brown's radial distortion) and mount; the ground is level. A panel is
 sampled by several rays per pixel, so that a distant tag blurs as on a real sensor.
@@ -22,28 +22,28 @@ from monstertruck_sim.world.plant import Caster, Plant
 from monstertruck_sim.world.scene import Surroundings
 
 Picture = NDArray[np.uint8]
-"""(height, width, 3): red, green, blue; the top row first."""
+"""Image of shape (height, width, 3): red, green, blue; the top row first."""
 Drawing = Callable[[], Picture]
-"""Makes a picture, in any thread, one at a time."""
+"""Draws a picture; callable in any thread, one call at a time."""
 
 WALLS, FLOOR, SKY = 0, 128, 192
 """First palette entries: 128 shades of wall, 64 of floor, 64 of sky."""
 RIM: Final = 1
-"""Cells of white paper round a tag's black square of eight cells."""
+"""Width of the white paper around a tag's black square, in cells; the square has eight."""
 CELLS: Final = 8
 PAPER_CELLS: Final = CELLS + 2 * RIM
 PAPER, INK = 235, 20
 _GRAIN: Final = 64
-"""The grain of the sensor is moved by up to so many pixels from picture to picture."""
+"""Maximum shift of the sensor's grain from picture to picture (pixels)."""
 
 
 class CameraPlace(NamedTuple):
-    """Pose of the camera at an instant."""
+    """Pose of the camera at a time."""
 
     centre: Array
-    """Position of the lens, (3,): in the map and above the ground (m)."""
+    """Position of the lens in the map, (3,) (m)."""
     axes: Array
-    """(3, 3), rows: its right, its down and its axis, in the map."""
+    """Rows: right, down and optical axis of the camera in the map, (3, 3)."""
 
 
 class FlatPanel(NamedTuple):
@@ -64,18 +64,18 @@ class FlatPanel(NamedTuple):
 
 
 class Holder(Protocol):
-    """Person who holds a board before a camera."""
+    """Person who holds a board in front of a camera."""
 
     def panel_at(self, time_ns: int, place: CameraPlace, /) -> FlatPanel:
-        """The board at an instant, before a camera at ``place``."""
+        """Return the board at a time, in front of a camera at ``place``."""
 
 
 def mounted(pose: Pose2, config: CameraConfig, attitude: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> CameraPlace:
-    """The camera of a robot at ``pose``.
+    """Return the camera place of a robot at ``pose``.
 
     Args:
         pose: pose of the robot's geometric centre.
-        config: its mount.
+        config: mount of the camera.
         attitude: pitch, roll (rad) and height (m) of the body.
     """
     body = rotation(pose[2], *attitude[:2])
@@ -85,16 +85,16 @@ def mounted(pose: Pose2, config: CameraConfig, attitude: tuple[float, float, flo
 
 
 class SimulatedView:
-    """``ViewSource``: the scene around a camera that is fixed to the robot.
+    """``ViewSource`` of a camera that is fixed to the robot.
 
     Args:
         plant: carrier of the camera.
-        cast: ranges to walls, things, people and robots.
+        cast: ranges to walls, obstacles, people and robots.
         config: lens, mount and noise.
-        tags: on the walls.
-        crowd: who walks around.
-        holder: holds a board before it.
-        wall_height: m.
+        tags: tags on the walls.
+        crowd: people in the world.
+        holder: person who holds a board in front of the camera.
+        wall_height: height of the walls (m).
         seed: seed of the noise; None: no noise.
 
     Raises:
@@ -143,7 +143,7 @@ class SimulatedView:
         return lambda: sensor(painter.picture(ranges, panels, place))
 
     def board_at(self, time_ns: int) -> FlatPanel | None:
-        """The board that a person holds before it, or None."""
+        """Return the board that a person holds in front of the camera, or None."""
         return None if self._holder is None else self._holder.panel_at(time_ns, self._place(time_ns))
 
     def _place(self, time_ns: int) -> CameraPlace:
@@ -164,7 +164,7 @@ class SimulatedView:
         return lambda picture: _grainy(lit(picture, config), seed, config.noise, row, column)
 
     def _in_view(self, place: CameraPlace) -> list[FlatPanel]:
-        """Tags before the camera that show it their front, the farthest one first."""
+        """Return the panels that face the camera in its view, the farthest one first."""
         found = []
         for panel in self._panels:
             away = panel.corner + (panel.right + panel.down) / 2 - place.centre
@@ -176,12 +176,12 @@ class SimulatedView:
 
 
 class Painter:
-    """Draw images of one size; stateless, so that threads may share it.
+    """Draws images of one size; stateless, so that threads may share it.
 
     Args:
         config: lens and mount.
         size: width and height (pixels).
-        wall_height: m.
+        wall_height: height of the walls (m).
     """
 
     def __init__(self, config: CameraConfig, size: tuple[int, int], wall_height: float) -> None:
@@ -210,21 +210,21 @@ class Painter:
             self._along = np.cos(fan).astype(np.float32)
         self._fan = fan
         self.azimuths: Array = fan + config.yaw
-        """Directions of the required ranges from the robot's axis, falling (rad)."""
+        """Directions of the required ranges from the robot's axis, decreasing (rad)."""
         depth = np.minimum(np.abs(slope) * self._focal / (height / 2), 1.0) * 63
         ground = (np.where(slope > 0, FLOOR, SKY) + depth).astype(np.uint8)
         self._column, self._slope, self._ground = (
             np.array(np.broadcast_to(part, (height, width)), order="C")
             for part in (column.astype(np.int32), slope, ground)
         )
-        """Map of every pixel: place of its azimuth in the fan, slope, and shade where no wall is."""
+        """Per pixel: index of its azimuth in the fan, slope, and shade where no wall is."""
 
     def picture(self, ranges: Array, panels: Sequence[FlatPanel], place: CameraPlace) -> Picture:
-        """Draw.
+        """Draw an image.
 
         Args:
             ranges: horizontal distance along each of ``azimuths``, (n,) (m); inf without a hit.
-            panels: the last one on top.
+            panels: panels, the last one on top.
             place: place of the camera.
         """
         depth = np.maximum(ranges * self._along, 0.05).astype(np.float32)
@@ -236,7 +236,7 @@ class Painter:
         return picture
 
     def draw(self, picture: Picture, panel: FlatPanel, place: CameraPlace, ranges: Array) -> None:
-        """Draw a panel over a picture; arguments as of ``picture``."""
+        """Draw a panel over a picture; see ``picture`` for the arguments."""
         corners = panel.corner + np.array((panel.right * 0, panel.right, panel.right + panel.down, panel.down))
         seen = (corners - place.centre) @ place.axes.T
         if (seen[:, 2] < 0.05).any():
@@ -277,7 +277,7 @@ class Painter:
         window[:] = np.rint(colours + (1 - share) * window).astype(np.uint8)
 
     def _unhidden(self, points: Array, place: CameraPlace, ranges: Array) -> NDArray[np.bool_]:
-        """Mark the points, relative to the camera in the map's axes, that no wall hides."""
+        """Return which points, relative to the camera in the map's axes, no wall hides."""
         axis = place.axes[2]
         ahead = np.arctan2(axis[1], axis[0])
         azimuths = np.angle(np.exp(1j * (np.arctan2(points[..., 1], points[..., 0]) - ahead)))
@@ -288,9 +288,9 @@ class Painter:
         return found
 
     def straight_pixels(self) -> tuple[float, Array]:
-        """Return the required scale of an image without distortion, and the place of every pixel in it, (h, w, 2).
+        """Return the scale of an undistorted image that covers the view, and every pixel's position in it, (h, w, 2).
 
-        The wider one has as many pixels.
+        The undistorted image has the same number of pixels.
         """
         width, height = self._size
         x, y = np.meshgrid(np.arange(width) - (width - 1) / 2, np.arange(height) - (height - 1) / 2)
@@ -306,7 +306,7 @@ class Painter:
         return np.stack((right * factor, down * factor), axis=-1)
 
     def _straight(self, right: Array, down: Array) -> tuple[Array, Array]:
-        """Directions of places in the picture, in focal lengths: the inverse of ``_bent``."""
+        """Return the directions of image points, in focal lengths: the inverse of ``_bent``."""
         if not (self._config.k1 or self._config.k2):
             return right, down
         x, y = right, down
@@ -328,7 +328,7 @@ def compile_kernels() -> None:
 
 
 def _between(texture: NDArray[np.uint8], across: Array, along: Array) -> NDArray[np.uint8]:
-    """A texture at places in its pixels, whose corners are whole numbers, by bilinear interpolation."""
+    """Sample a texture at positions in pixels, whose corners are integers, by bilinear interpolation."""
     cv2 = opencv("sim.world.board")
     at = (np.nan_to_num(places - 0.5, posinf=-1.0, neginf=-1.0).astype(np.float32) for places in (across, along))
     return np.asarray(cv2.remap(texture, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), dtype=np.uint8)
@@ -338,7 +338,7 @@ def opencv(key: str) -> Any:
     """Import OpenCV, which drawing the configuration's ``key`` requires.
 
     Raises:
-        NotInstalledError: the extra ``vision`` is not there.
+        NotInstalledError: the extra ``vision`` is not installed.
     """
     try:
         import cv2  # noqa: PLC0415  # the library of an extra
@@ -349,10 +349,10 @@ def opencv(key: str) -> Any:
 
 @cache
 def tag_pattern(tag: int) -> NDArray[np.uint8]:
-    """A tag of family 36h11 on its white paper, a pixel a cell, (10, 10).
+    """Return a tag of family 36h11 with its white border, one pixel per cell, (10, 10).
 
     Raises:
-        NotInstalledError: the extra ``vision`` is not there.
+        NotInstalledError: the extra ``vision`` is not installed.
     """
     cv2 = opencv("sim.world.tags")
     family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
@@ -361,7 +361,7 @@ def tag_pattern(tag: int) -> NDArray[np.uint8]:
 
 
 def tag_panel(tag: TagConfig) -> FlatPanel:
-    """A tag on its paper, upright and facing ``yaw``, or lying with its upper edge towards it."""
+    """Return the panel of a tag: upright and facing ``yaw``, or lying with its upper edge towards ``yaw``."""
     pattern = tag_pattern(tag.tag)
     side = tag.size * len(pattern) / CELLS
     right, up = tag_axes(tag.yaw, lies=tag.lies)
@@ -371,7 +371,7 @@ def tag_panel(tag: TagConfig) -> FlatPanel:
 
 
 def tag_axes(yaw: float, *, lies: bool) -> tuple[Array, Array]:
-    """Unit vectors along a tag's upper edge, from left to right, and upwards on it."""
+    """Return the unit vectors of a tag's upper edge, from left to right, and of its upward direction."""
     c, s = cos(yaw), sin(yaw)
     if lies:
         return np.array((s, -c, 0.0)), np.array((c, s, 0.0))
@@ -379,7 +379,7 @@ def tag_axes(yaw: float, *, lies: bool) -> tuple[Array, Array]:
 
 
 def person_panel(x: float, y: float, radius: float, place: CameraPlace) -> FlatPanel:
-    """Person, turned to the camera."""
+    """Return the panel of a person, facing the camera."""
     texture, opaque = _person()
     toward = place.centre[:2] - (x, y)
     toward = toward / max(hypot(*toward), 1e-6)
@@ -391,7 +391,7 @@ def person_panel(x: float, y: float, radius: float, place: CameraPlace) -> FlatP
 
 @cache
 def _person() -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Texture and outline of a person: 2 cm a pixel at a radius of 0.2 m."""
+    """Return texture and outline of a person: 2 cm per pixel at a radius of 0.2 m."""
     rows, columns = np.mgrid[0:85, 0:20]
     head = ((rows - 7) / 7.5) ** 2 + ((columns - 9.5) / 5.5) ** 2 < 1
     trunk = (rows >= 15) & (rows < 46) & (np.abs(columns - 9.5) < 9.6 - np.maximum(0, 18 - rows))
@@ -403,7 +403,7 @@ def _person() -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
 
 @cache
 def _palette() -> NDArray[np.uint8]:
-    """(256, 3)."""
+    """Return the palette, (256, 3)."""
     rows = np.zeros((256, 3))
     ramp = np.linspace(0.0, 1.0, 64)[:, None]
     rows[WALLS:FLOOR] = np.linspace(0.1, 1.0, 128)[:, None] * (225, 215, 200)
@@ -413,7 +413,7 @@ def _palette() -> NDArray[np.uint8]:
 
 
 def lit(picture: Picture, config: CameraConfig) -> Picture:
-    """Return a picture in the light, and as sharp, as configured.
+    """Return a picture with the configured brightness and blur.
 
     Raises:
         NotInstalledError: the extra ``vision``, needed for ``blur``, is not installed.
@@ -434,7 +434,7 @@ def _grainy(picture: Picture, seed: int, noise: float, row: int, column: int) ->
 
 @njit(cache=True)
 def _added(picture: Picture, grain: NDArray[np.int16], row: int, column: int) -> Picture:
-    """Add the tile of the grain that begins at (row, column), equal in all colours."""
+    """Add the grain tile that begins at (row, column), equal in all colours."""
     height, width, colours = picture.shape
     noisy = np.empty_like(picture)
     for i in range(height):
@@ -455,7 +455,7 @@ def _painted(
     ground: NDArray[np.uint8],
     palette: NDArray[np.uint8],
 ) -> Picture:
-    """Colours of pixels (height, width): wall in their column of the fan between its slopes, or ground."""
+    """Return the colours of pixels (height, width): wall between the slopes of their fan column, otherwise ground."""
     height, width = slope.shape
     picture = np.empty((height, width, 3), np.uint8)
     for i in range(height):

@@ -20,10 +20,10 @@ from monstertruck_sim.world.config import MechanicsConfig, SimTruckConfig
 
 
 def mechanics(truck: SimTruckConfig, config: MechanicsConfig) -> Mechanics:
-    """Inputs of the description.
+    """Return the inputs of the description.
 
     Raises:
-        InputError: masses no robot can have.
+        InputError: impossible masses.
     """
     try:
         return Mechanics(
@@ -46,7 +46,7 @@ def mechanics(truck: SimTruckConfig, config: MechanicsConfig) -> Mechanics:
 
 
 def platform_wheels(truck: SimTruckConfig) -> tuple[Wheel, ...]:
-    """Driven wheels of a body on a platform, in the order of its shafts; of other bodies none."""
+    """Return the driven wheels of a platform, in the order of its shafts; empty for other bodies."""
     body, radius = truck.body, truck.wheel_radius
     if isinstance(body, OmniBody):
         return omni(body.circle, radius, body.count).swedish
@@ -73,7 +73,7 @@ def description(
         head: the lidar on its joints; None for a fixed lidar.
 
     Raises:
-        InputError: masses or springs no robot can have.
+        InputError: impossible masses or springs.
     """
     try:
         return _description(truck, parts, sensors, head)

@@ -1,4 +1,4 @@
-"""Reproducible noise: every draw is a function of (seed, stream, index), never of who asked before."""
+"""Reproducible noise: every draw is a function of (seed, stream, index), independent of the order of requests."""
 
 import numpy as np
 
@@ -14,17 +14,17 @@ _BLOCK = 512
 
 
 def generator(seed: int, stream: int, index: int = 0) -> np.random.Generator:
-    """Generator of one block of draws, by a counter-based algorithm."""
+    """Return the generator of one block of draws, by a counter-based algorithm."""
     return np.random.Generator(np.random.Philox(key=[seed, stream], counter=[0, index, 0, 0]))
 
 
 class WhiteNoise:
-    """Standard normal noise of ``size`` channels, drawn by the block of neighbouring indices.
+    """Standard normal noise of ``size`` channels, drawn in blocks of neighbouring indices.
 
     Args:
         seed: seed of the world.
         stream: one of the streams above.
-        size: channels.
+        size: number of channels.
     """
 
     def __init__(self, seed: int, stream: int, size: int = 1) -> None:
@@ -33,7 +33,7 @@ class WhiteNoise:
         self._values: list[float] = []
 
     def at(self, index: int) -> list[float]:
-        """Values of an index (0 or more), one a channel."""
+        """Return the values of an index (0 or more), one per channel."""
         block, row = divmod(index, _BLOCK)
         if block != self._block:
             drawn = generator(self._seed, self._stream, block).standard_normal(_BLOCK * self._size)
@@ -42,13 +42,13 @@ class WhiteNoise:
 
 
 class SlowNoise:
-    """White noise drawn every ``period_ns``, straight lines between.
+    """White noise drawn every ``period_ns``, with linear interpolation.
 
     Args:
         seed: seed of the world.
         stream: one of the streams above.
-        size: channels.
-        period_ns: between draws.
+        size: number of channels.
+        period_ns: interval between draws (ns).
     """
 
     def __init__(self, seed: int, stream: int, size: int, period_ns: int) -> None:
@@ -56,10 +56,10 @@ class SlowNoise:
         self._period = period_ns
         self._slot = -1
         self._lines: list[tuple[float, float]] = []
-        """Value at the slot's beginning and change over it, one a channel."""
+        """Value at the start of the slot and change over it, per channel."""
 
     def at(self, elapsed_ns: int) -> list[float]:
-        """Values at a time since the world's start, one a channel."""
+        """Return the values at a time since the world's start, one per channel."""
         slot, rest = divmod(elapsed_ns, self._period)
         if slot != self._slot:
             ends = self._white.at(slot), self._white.at(slot + 1)

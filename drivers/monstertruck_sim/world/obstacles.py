@@ -1,4 +1,4 @@
-"""Things that can be put into the world and taken away while it runs: discs and upright boxes."""
+"""Obstacles that can be added to and removed from a running world: discs and upright boxes."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -122,7 +122,7 @@ class Person:
             self._turn_back()
 
     def _way_on(self, ahead: float, others: Sequence[Round]) -> float | None:
-        """Return the direction to walk in, or None to stand."""
+        """Return the walking direction (rad), or None to stand still."""
         if self._config.before == "walk_on" or not self._blocked(ahead, others):
             return ahead
         if self._config.before == "turn":

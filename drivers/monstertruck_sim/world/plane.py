@@ -1,4 +1,4 @@
-"""The engine ``plane``: a footprint that moves over a map, tilted by a profile of the ground or as commanded."""
+"""The engine ``plane``: a footprint that moves over a map, with a tilt from the ground profile or as commanded."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -75,7 +75,7 @@ class PlanOutline:
         return 0.0 if self._free else self._depth(pose)
 
     def _way(self, a: Pose2, b: Pose2) -> float:
-        """Return an upper bound on the displacement of any footprint point between two poses (m)."""
+        """Return an upper bound of the displacement of any footprint point between two poses (m)."""
         return hypot(b[0] - a[0], b[1] - a[1]) + abs(b[2] - a[2]) * self._half_diagonal
 
     def _depth(self, pose: Pose2, room: float = 0.0) -> float:

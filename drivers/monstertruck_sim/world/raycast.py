@@ -1,9 +1,8 @@
 """Exact ray casting and footprint contact on an occupancy grid, by numba.
 
-A range is the distance to the boundary of the first occupied cell, not a multiple of the cell size. A ray leaps over
-the empty square around its cell, as large as the grid's ``clearance`` there allows, to the point where it
-leaves that square: it visits a subset of the cells of a walk cell by cell (Amanatides and Woo, "A Fast Voxel
-Traversal Algorithm for Ray Tracing", 1987), so the range is the same.
+A range is the distance to the boundary of the first occupied cell, not a multiple of the cell size. A ray skips the
+empty square around its cell, whose size is the grid's ``clearance``: it visits a subset of the cells of a walk cell by
+cell (Amanatides and Woo, "A Fast Voxel Traversal Algorithm for Ray Tracing", 1987), so the range is the same.
 """
 
 from math import cos, floor, inf, sin, sqrt
@@ -19,9 +18,9 @@ Clearance = NDArray[np.uint8]
 
 @njit(cache=True)
 def clearance(occupied: NDArray[np.bool_]) -> Clearance:
-    """Cells to the nearest occupied one, along the longer axis; 0 in it; at most 255.
+    """Return each cell's distance to the nearest occupied cell (Chebyshev, in cells), at most 255.
 
-    Two passes, each from one corner over the neighbours it has seen.
+    Two passes, each from one corner over the neighbours already visited.
 
     Args:
         occupied: (rows, columns).
@@ -54,7 +53,7 @@ def clearance(occupied: NDArray[np.bool_]) -> Clearance:
 
 @njit(cache=True)
 def _entry(x: float, direction: float, cells: int) -> float:
-    """Distance along a ray to the point where it is between 0 and ``cells`` along one axis; inf if never."""
+    """Distance along a ray at which it enters the range 0 to ``cells`` on one axis; inf if never."""
     if 0.0 <= x < cells:
         return 0.0
     if direction == 0.0 or (x < 0.0) != (direction > 0.0):
@@ -64,13 +63,13 @@ def _entry(x: float, direction: float, cells: int) -> float:
 
 @njit(cache=True)
 def _walk(clear: Clearance, x: float, y: float, dx: float, dy: float, reach: float) -> float:
-    """Distance from (x, y) along the unit vector (dx, dy), all in cells; inf beyond ``reach``."""
+    """Distance along (dx, dy) from (x, y) to the first occupied cell, in cells; inf beyond ``reach``."""
     rows, columns = clear.shape
     along = max(_entry(x, dx, columns), _entry(y, dy, rows))
     if along > reach:
         return inf
     column, row = floor(x + along * dx), floor(y + along * dy)
-    if along > 0.0:  # on the grid's edge, give or take a rounding
+    if along > 0.0:  # on the grid's edge, apart from rounding
         column, row = min(max(column, 0), columns - 1), min(max(row, 0), rows - 1)
     step_x, step_y = (1 if dx > 0.0 else -1), (1 if dy > 0.0 else -1)
     near_x, near_y = (0 if dx > 0.0 else 1), (0 if dy > 0.0 else 1)
@@ -172,8 +171,8 @@ def grid_penetration(
         x: centre of the rectangle, m, relative to the grid's lower left corner.
         y: as ``x``.
         yaw: direction of its length (rad).
-        length: m.
-        width: m.
+        length: length of the rectangle (m).
+        width: width of the rectangle (m).
     """
     rows, columns = occupied.shape
     c, s = cos(yaw), sin(yaw)

@@ -63,7 +63,7 @@ class Neighbour(Protocol):
         """Speed of the body's fastest point (m/s)."""
 
     def integrate(self, time_ns: int) -> None:
-        """Move on to an instant; the first call sets the start."""
+        """Advance to a time; the first call sets the start."""
 
     def outlines(self, times_ns: NDArray[np.int64]) -> list[Box]:
         """Footprints of the moving bodies at sampled times in the last half second."""
@@ -109,11 +109,11 @@ class Surroundings:
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
-        """Things that are not on the map and do not move by themselves."""
+        """Obstacles that are not on the map and do not move by themselves."""
         return self._obstacles
 
     def set_obstacles(self, obstacles: tuple[Obstacle, ...]) -> None:
-        """Replace them."""
+        """Replace the obstacles."""
         self._obstacles = obstacles
         self._fixed = discs_and_segments(obstacles)
 
@@ -139,7 +139,7 @@ class Surroundings:
         return [body.plant for body in self.bodies if body.plant is not own]
 
     def advance(self, time_ns: int) -> None:
-        """Bring everything that moves to the last point of the grid before an instant."""
+        """Advance all moving bodies to the last grid point before a time."""
         if len(self.bodies) < 2 and not self.people:
             return
         if self._start_ns is None:
@@ -175,7 +175,7 @@ class Surroundings:
         return sum(depth for _, _, depth in self._met(box, name))
 
     def report(self, box: Box, name: str, speed: float) -> None:
-        """The robot ``name`` cannot move on to ``box``: a contact with whom it would meet there."""
+        """Report a contact of the robot ``name`` with the bodies that block its move to ``box``."""
         for other, pace, _ in self._met(box, name):
             self._contact(name, other, speed, pace)
 
@@ -206,7 +206,7 @@ class Surroundings:
         self.on_contact(contact)
 
     def _part(self) -> None:
-        """Forget pairs that are apart: if they meet again, it is another contact."""
+        """Forget pairs of bodies that have separated: their next contact is a new one."""
         for pair in sorted(self._touching):
             # 0.08: minimum distance of bodies that have parted, m: more than a stride
             first, second = (self._shape(name, 2 * 0.08) for name in pair)
@@ -266,8 +266,8 @@ class Surroundings:
             xs: (n,) origins in the map frame (m).
             ys: (n,) as ``xs``.
             angles: (n,) directions in the map frame (rad).
-            reach: m.
-            times_ns: (n,) instants of the rays, rising: the others are met where they were then; None: now.
+            reach: maximum distance (m).
+            times_ns: (n,) times of the rays, increasing: they hit moving bodies where these were then; None: now.
             without: name of the robot with the sensor.
         """
         others = [body for body in self.bodies if body.name != without]
@@ -277,7 +277,7 @@ class Surroundings:
             now: list[Obstacle] = [*(body.outline for body in others), *(person.disc for person in self.people)]
             return self._cast(xs, ys, angles, reach, discs_and_segments((*self._obstacles, *now)))
         count = len(angles)
-        rays = 64  # rays of a sweep that meet the others at one instant: 6 ms of the lidar's revolution
+        rays = 64  # rays of a sweep that hit moving bodies at one time: 6 ms of the lidar's revolution
         middles = times_ns[np.minimum(np.arange(0, count, rays) + rays // 2, count - 1)]
         boxes = [body.outlines(middles) for body in others]
         elapsed = (middles - (self._start_ns or 0)).astype(float)

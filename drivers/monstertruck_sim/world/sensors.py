@@ -1,4 +1,4 @@
-"""Physics of the devices' sensing elements, behind the emulators."""
+"""Physics of the sensing elements, for the emulators."""
 
 from collections.abc import Callable
 from math import atan2, degrees, hypot, pi, radians
@@ -78,14 +78,14 @@ class UnevenGround(Protocol):
         """Return the heights at points in the map frame (m); all arrays have one shape."""
 
     def cast(self, xs: Array, ys: Array, zs: Array, headings: Array, rises: Array, reach: float) -> Array:
-        """Horizontal distances along beams from points; inf beyond ``reach``; all (n,)."""
+        """Return horizontal distances along beams from points, all of shape (n,); inf beyond ``reach``."""
 
 
 class PlaneSweep:
     """Beams over a plane with upright walls, or over uneven ground.
 
-    A beam meets the ground or passes over walls of finite height that stand on it. The mount is as high over the
-    ground as on level ground, before the geometric centre.
+    A beam hits the ground, hits a wall, or passes over walls of finite height. The height of the mount above the ground
+    is the same as on level ground.
 
     Args:
         cast: ranges to the walls.
@@ -97,7 +97,7 @@ class PlaneSweep:
         self._cast, self._terrain, self._config = cast, terrain, config
 
     def __call__(self, poses: Array, beams: Beams | None, times_ns: NDArray[np.int64], reach: float) -> Array:
-        """Implements ``Sweep``."""
+        """See ``Sweep``."""
         x, y, yaw, pitch, roll, _ = poses
         xs, ys = self._places(x, y, yaw)
         # 1e-4: maximum tilt of a level robot, rad
@@ -109,14 +109,14 @@ class PlaneSweep:
         return self._over(self._terrain, poses, beams, times_ns, reach)
 
     def _places(self, x: Array, y: Array, yaw: Array) -> tuple[Array, Array]:
-        """Pose of the mount in the map frame for a body at (x, y, yaw)."""
+        """Return the position of the mount in the map frame for a body at (x, y, yaw)."""
         ahead, aside, c, s = self._config.x, self._config.y, np.cos(yaw), np.sin(yaw)
         return x + ahead * c - aside * s, y + ahead * s + aside * c
 
     def _tilted(
         self, xs: Array, ys: Array, yaw: Array, beams: Beams, times_ns: NDArray[np.int64], reach: float
     ) -> Array:
-        """Ranges along beams whose directions are given in the truck's level frame."""
+        """Return ranges along beams whose directions are given in the robot's level frame."""
         config = self._config
         forward, left, up = beams
         level = np.hypot(forward, left)
@@ -128,7 +128,7 @@ class PlaneSweep:
         return nearest
 
     def _over(self, terrain: Terrain, poses: Array, beams: Beams, times_ns: NDArray[np.int64], reach: float) -> Array:
-        """Ranges over uneven ground; arguments as of ``_tilted``."""
+        """Return ranges over uneven ground; see ``_tilted`` for the arguments."""
         config, (x, y, yaw, pitch, *_) = self._config, poses
         xs, ys = self._places(x, y, yaw)
         zs = terrain.height(x, y) - config.x * np.sin(pitch) + config.height
@@ -149,7 +149,7 @@ def over(
 
     Args:
         cast: horizontal ranges to the walls.
-        ground: under them.
+        ground: the ground.
         config: configuration of the lidar.
         origins: origins of the beams in the map frame (m).
         yaw: yaw of the robot, (n,).
@@ -171,10 +171,10 @@ def over(
 
 
 class SimulatedLidar:
-    """``ScannedRoom``: every beam leaves from where the truck is at that beam's instant.
+    """``ScannedRoom``: every beam starts at the truck's pose at the time of that beam.
 
-    Noise is Gaussian with the data sheet's bound at two standard deviations, as a maker's accuracy covers nearly all
-    readings. Joints of a mount turn it about its own centre.
+    Noise is Gaussian with the data sheet's bound at two standard deviations, as a manufacturer's accuracy covers nearly
+    all readings. The joints of a mount turn the lidar about the mount's centre.
 
     Args:
         plant: carrier of the sensor.
@@ -186,14 +186,14 @@ class SimulatedLidar:
     def __init__(self, plant: Plant, sweep: Sweep, config: LidarConfig, seed: int | None) -> None:
         self.joints: JointSource | None = None
         self.board_at: Callable[[int], FlatPanel | None] = lambda _: None
-        """Board that a person holds before the robot."""
+        """Board that a person holds in front of the robot."""
         self._plant, self._sweep, self._config, self._seed = plant, sweep, config, seed
         self._lost = (np.arange(SWEEP_STEPS) < config.first_step) | (np.arange(SWEEP_STEPS) > config.last_step)
         """Steps that never measure."""
         self._mounted = _mounted(config, LEVEL_BEAMS)
 
     def scan(self, time_ns: int) -> NDArray[np.int32]:
-        """Distances in mm of the revolution that began at ``time_ns``, (769,); codes below 20 are errors.
+        """Return the distances (mm) of the revolution started at ``time_ns``, (769,); values below 20 are error codes.
 
         Call it up to half a second after the sweep for exact poses; an earlier call extrapolates the truck's motion
         during the sweep.
@@ -204,7 +204,7 @@ class SimulatedLidar:
         return self._measure(ranges, time_ns, sheet)
 
     def beams(self, bearings: Array, times_ns: NDArray[np.int64], sheet: RangeSheet) -> Array:
-        """Implements ``BeamSource``."""
+        """See ``BeamSource``."""
         first = int(times_ns[0])
         self._plant.advance(int(times_ns[-1]))
         sheet = self._sheet(sheet)
@@ -218,7 +218,7 @@ class SimulatedLidar:
         return ranges
 
     def _sheet(self, sheet: RangeSheet) -> RangeSheet:
-        """The device's own, but for ranges that the world's configuration gives."""
+        """Return the device's data sheet, with the ranges that the world's configuration overrides."""
         config = self._config
         least = sheet.least if config.min_range is None else config.min_range
         return sheet._replace(least=least, greatest=config.max_range or sheet.greatest)
@@ -275,7 +275,7 @@ class SimulatedMotor:
 
     @property
     def target_rpm(self) -> float:
-        """Speed that the controller asks for; 0 while the power stage is off."""
+        """Speed that the controller commands (rpm); 0 while the power stage is off."""
         return self._sign * (self._plant.shafts[self._shaft].target or 0.0)
 
     def reading(self, time_ns: int) -> MotorReading:
@@ -302,12 +302,12 @@ class SimulatedServos:
 
     @property
     def inputs(self) -> frozenset[int]:
-        """Inputs of the battery's voltage and current."""
+        """Analog inputs of the battery's voltage and current."""
         current = self._config.current_channel
         return frozenset({self._config.channel, *(() if current is None else (current,))})
 
     def attach(self, pulses: PulseSource) -> None:
-        """Name the controller whose pulses move the servos."""
+        """Set the controller whose pulses move the servos."""
         self._plant.pulses = pulses
 
     def advance(self, time_ns: int) -> None:
@@ -395,8 +395,8 @@ class SimulatedCompass:
 class SimulatedImu:
     """``ImuSource``: gyroscopes and accelerometers at the geometric centre, axes x forward, y left, z up.
 
-    They feel the body's turning (in the plane: its yaw rate), the reaction to gravity and the body's own acceleration,
-    turned by the tilt.
+    They measure the body's rotation (in the plane: its yaw rate), and gravity and the body's own acceleration, rotated
+    by the tilt.
     """
 
     def __init__(self, plant: Plant, config: ImuModelConfig, seed: int | None) -> None:
@@ -429,10 +429,10 @@ class SimulatedImu:
 
 
 class SimulatedRearWheels:
-    """``WheelSource``: the wheels on the rear axle roll as the ground passes, whatever the driven wheel does.
+    """``WheelSource``: the wheels of the rear axle roll with the robot's motion, independently of the driven wheel.
 
     Args:
-        plant: moves the robot.
+        plant: physics of the robot.
         config: track and radius.
     """
 
@@ -453,7 +453,7 @@ class SimulatedRearWheels:
         return self._rolled[0] / self._radius, self._rolled[1] / self._radius
 
     def _roll(self, before: Pose2, now: Pose2, dt: int) -> None:
-        """Add the motion along an arc; skip it if the robot was carried."""
+        """Add the rotation along an arc; skip it if the robot was carried."""
         way = hypot(now[0] - before[0], now[1] - before[1])
         if way > 5.0 * dt / SECOND:  # maximum speed between two samples of a robot that was not carried, m/s
             return
@@ -465,18 +465,18 @@ class SimulatedRearWheels:
 
 
 def turned(vector: tuple[Real, Real, Real], pitch: Real, roll: Real) -> tuple[Real, Real, Real]:
-    """Inverse of ``_to_body``, for one vector or for many, each with its own angles."""
+    """Apply the inverse of ``_to_body`` to one vector, or to many with individual angles."""
     x, y, z = vector
     y, z = cos(roll) * y - sin(roll) * z, sin(roll) * y + cos(roll) * z
     return cos(pitch) * x + sin(pitch) * z, y, cos(pitch) * z - sin(pitch) * x
 
 
 def _mounted(config: LidarConfig, level: Beams) -> Beams | None:
-    """Beams of a lidar that is not mounted straight, in the frame of its carrier; None if it is mounted straight.
+    """Return the beams of a lidar in the frame of its carrier; None if it is mounted straight.
 
     Args:
-        config: its mount.
-        level: the beams in its own frame.
+        config: mount of the lidar.
+        level: the beams in the lidar's own frame.
     """
     if config.yaw == config.pitch == config.roll == 0.0:
         return None
@@ -486,7 +486,7 @@ def _mounted(config: LidarConfig, level: Beams) -> Beams | None:
 
 
 def _to_body(v: Xyz, pitch: float, roll: float) -> Xyz:
-    """A vector of the level frame in the body frame: Rx(-roll) Ry(-pitch) v."""
+    """Transform a vector from the level frame to the body frame: Rx(-roll) Ry(-pitch) v."""
     x = cos(pitch) * v[0] - sin(pitch) * v[2]
     z = sin(pitch) * v[0] + cos(pitch) * v[2]
     return x, cos(roll) * v[1] + sin(roll) * z, cos(roll) * z - sin(roll) * v[1]

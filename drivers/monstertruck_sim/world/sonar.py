@@ -27,11 +27,13 @@ SPEED_OF_SOUND: Final = 343.0
 
 
 Solids = Callable[[float, float, float, float], Caster | None]
-"""Solids that rays hit besides the walls of the map, for a body of a yaw, pitch and roll (rad) and height (m)."""
+"""Returns a caster for solids that rays hit in addition to the map's walls, for a body of a yaw, pitch and roll (rad)
+and height (m).
+"""
 
 
 class Ping(NamedTuple):
-    """Ping of a sonar: place (m) and direction (rad) in the map frame, time (s)."""
+    """Ping of a sonar: position (m) and direction (rad) in the map frame, time (s)."""
 
     x: float
     y: float
@@ -49,13 +51,13 @@ class Surface(NamedTuple):
     ranges: Array
     """Distances from the sonar (m); inf without a hit within ``audible``."""
     normals: Array
-    """Direction of the wall's normal, rad (either of both)."""
+    """Direction of the wall's normal (rad), in either sense."""
     scatters: NDArray[np.bool_]
-    """Edges and corners, which reflect in all directions."""
+    """Whether a point is an edge or a corner, which reflects in all directions."""
 
 
 def placed(sonar: SonarPlace, x: float, y: float, yaw: float, time: float = 0.0) -> Ping:
-    """A sonar's ping where the body is at (x, y, yaw) in the map frame."""
+    """Return the ping of a sonar on a body at (x, y, yaw) in the map frame."""
     c, s = cos(yaw), sin(yaw)
     return Ping(x + c * sonar.x - s * sonar.y, y + s * sonar.x + c * sonar.y, yaw + sonar.yaw, time)
 
@@ -78,16 +80,16 @@ def surface(cast: Caster, ping: Ping, model: SonarModelConfig) -> Surface:
 
 
 def leaning(cast: Caster, yaw: float, pitch: float, roll: float, over: float) -> Caster:
-    """Casts rays that lean with a body, and measures along them.
+    """Return a caster for rays that tilt with a body; it measures along them.
 
-    The ground gives no echo: it is met at too flat an angle.
+    The ground gives no echo, because its angle of incidence is too flat.
 
     Args:
         cast: ranges to the walls in the horizontal plane, for the ray angles of a level body.
         yaw: yaw of the body in the map frame (rad).
         pitch: pitch of the body, nose down positive (rad).
         roll: roll of the body, right side down positive (rad).
-        over: height of the walls over the sonars (m); sound above it passes.
+        over: height of the walls above the sonars (m); sound above it passes.
     """
     if pitch == 0.0 and roll == 0.0:
         return cast
@@ -119,7 +121,7 @@ def cone(surfaces: Sequence[Surface], listener: Ping, model: SonarModelConfig) -
 
     Args:
         surfaces: surfaces of every sonar that sent anything since the last sound died away, including ``listener``.
-        listener: place, axis, and when it sent.
+        listener: position, axis and send time of the listening sonar.
         model: settings.
     """
     return min((_arrival(found, listener, model) for found in surfaces), default=inf)
@@ -143,7 +145,7 @@ def heard(distance: float, model: SonarModelConfig, noise: np.random.Generator |
 
 
 def _normals(x: Array, y: Array, ranges: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Direction of the wall's normal at every point, by the principal axes of the points around; and edges."""
+    """Return the direction of the wall's normal at every point, by principal axes of its neighbours, and the edges."""
     count = len(ranges)
     near, far = np.minimum(ranges[1:], ranges[:-1]), np.maximum(ranges[1:], ranges[:-1])
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -199,7 +201,7 @@ def _turn(angles: Array) -> Array:
 
 
 class SimulatedSonars:
-    """``SonarSource``: every ping leaves from where the body is then, and is heard by all others until it dies away.
+    """``SonarSource``: every ping starts at the body's current pose, and all other sonars detect it until it decays.
 
     Args:
         plant: the robot that carries the sonars; they lean with it.
@@ -221,7 +223,7 @@ class SimulatedSonars:
     ) -> None:
         self._plant, self._cast, self._config, self._seed, self._solids = plant, cast, config, seed, solids
         self._over = wall_height - config.height
-        # 32: pings that are remembered: more than are sent before the sound of one dies away
+        # 32: number of recent pings kept: more than are sent before the sound of one decays
         self._pings: deque[tuple[str, Ping, Caster, Surface | None]] = deque(maxlen=32)
         self._heard = 0
 

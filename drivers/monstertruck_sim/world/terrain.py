@@ -1,4 +1,4 @@
-"""Terrain: ground height, beam intersections and body tilt; or a body tilt that oscillates over time."""
+"""Terrain: ground height, beam intersections and body tilt; and a body tilt that oscillates."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -16,7 +16,7 @@ from monstertruck_sim.world.config import RoughPatch, SinusoidTilt
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """Height of the ground along x, the same for every y: straight lines between points.
+    """Height of the ground along x, the same for every y, by linear interpolation between points.
 
     Args:
         points: (x, z) in the map frame, m, x rising; constant beyond the ends.
@@ -36,8 +36,8 @@ class Terrain:
     """Height of the ground over the plane.
 
     Args:
-        profile: along x.
-        patches: rough ground on it.
+        profile: profile along x.
+        patches: patches of rough ground.
     """
 
     def __init__(self, profile: Profile, patches: tuple[RoughPatch, ...]) -> None:
@@ -68,8 +68,8 @@ class Terrain:
             ys: y of the origins.
             zs: z of the origins.
             headings: directions in the plane, (n,) (rad).
-            rises: metres upwards a metre of horizontal distance, (n,).
-            reach: longest horizontal distance (m).
+            rises: rise per metre of horizontal distance, (n,).
+            reach: maximum horizontal distance (m).
         """
         step = 0.05  # horizontal distance between two samples along a beam, m
         ways = np.arange(0.0, reach + step, step)
@@ -91,7 +91,7 @@ def rocking(config: SinusoidTilt, elapsed_ns: int) -> tuple[float, float]:
 
 
 def profile_path(map_path: Path) -> Path:
-    """Path of the ground profile of a map, if it has one."""
+    """Return the path of a map's ground profile, whether or not it exists."""
     return map_path.with_suffix(".profile.yaml")
 
 
@@ -99,7 +99,7 @@ def load_profile(path: Path) -> Profile:
     """Read ``points: [[x, z], ...]``.
 
     Raises:
-        InputError: naming file and key.
+        InputError: the file is invalid; the text names file and key.
     """
     keys = read_yaml(path)
     points: Any = keys.get("points") if isinstance(keys, dict) else None

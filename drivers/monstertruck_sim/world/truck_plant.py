@@ -28,7 +28,7 @@ Tilt = Callable[[int, float, float, float], tuple[float, float]]
 
 
 class TruckPlant(Plant):
-    """One robot in its surroundings: by default the truck, else the body that ``config`` names.
+    """One robot in its surroundings: the truck by default, or the body in ``config``.
 
     Every driven shaft has its own motor, clutch and share of the mass.
 
@@ -102,7 +102,7 @@ class TruckPlant(Plant):
         self._draw(dt, self._pulls)
 
     def _drive(self, i: int, shaft: Shaft, dt: float) -> None:
-        """Wheels follow their motor as fast as the clutch can pull mass, slope and rolling resistance."""
+        """Let the wheels follow their motor, within the force that the clutch can transmit."""
         motor, speed = self.config.motor, self._wheel_speeds[i]
         wanted = self._chassis.drivetrain.speed(shaft.rpm * RPM)
         rolling = self._rolling * min(max(speed / 0.01, -1.0), 1.0)
@@ -179,8 +179,8 @@ class TruckPlant(Plant):
 class _Steering:
     """Steering angles behind the linkage, and speed of the body per speed of the wheels; recomputed on change.
 
-    The truck's one motor drives four wheels through open differentials: it turns with the mean of the speeds that
-    the body drags them, each along its own angle.
+    The truck's one motor drives four wheels through open differentials: it turns at the mean of the wheel speeds that
+    the body's motion imposes, each along its own angle.
     """
 
     def __init__(self, chassis: Chassis) -> None:

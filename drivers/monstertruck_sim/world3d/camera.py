@@ -1,4 +1,4 @@
-"""The truck's camera in three dimensions: rendered by software (EGL) in a separate thread, then bent by the lens."""
+"""The truck's camera in three dimensions: rendered in software (EGL) in a thread, then distorted by the lens."""
 
 import weakref
 from concurrent.futures import ThreadPoolExecutor
@@ -14,18 +14,18 @@ from monstertruck_sim.world3d.plant import RigidPlant
 
 
 class RenderedView(SimulatedView):
-    """``ViewSource`` of a robot of rigid bodies; questions about the plane are answered by ``SimulatedView``.
+    """``ViewSource`` of a robot of rigid bodies; ``SimulatedView`` provides everything in the plane.
 
     Args:
         drawn: equivalent camera in the plane.
 
     Raises:
         NotInstalledError: this computer has no EGL.
-        InputError: the robot is none of rigid bodies.
+        InputError: the robot has no rigid bodies.
     """
 
     HIDDEN: tuple[Group, ...] = (Group.ROBOT,)
-    """Groups that its pictures omit: the robot that carries it."""
+    """Groups omitted from its pictures: the robot that carries it."""
 
     def __init__(self, drawn: SimulatedView) -> None:
         self.__dict__.update(drawn.__dict__)
@@ -36,7 +36,7 @@ class RenderedView(SimulatedView):
         """An EGL context belongs to one thread."""
         self._renderers: dict[tuple[int, int], tuple[WorldRenderer, float, Painter]] = {}
         self._renderer((640, 480))  # size in pixels of the test image that shows whether this computer can render
-        # At the program's end the thread is gone before, and the context with it.
+        # At the program's end the thread, and with it the context, is already gone.
         weakref.finalize(self, _close, self._thread, self._renderers).atexit = False
 
     def exposure(self, time_ns: int, size: tuple[int, int]) -> Drawing:
@@ -76,7 +76,7 @@ class RenderedView(SimulatedView):
 
 
 def _bent(picture: Picture, wider: float, painter: Painter) -> Picture:
-    """Through the lens: each pixel from where the picture without distortion has it."""
+    """Distort a picture by the lens: each pixel is taken from its position in the undistorted picture."""
     if wider == 1.0:
         return picture
     import cv2  # noqa: PLC0415  # the library of an extra

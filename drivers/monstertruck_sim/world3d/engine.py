@@ -1,8 +1,8 @@
-"""The engine ``mujoco``: one robot of rigid bodies in the surroundings that all engines share.
+"""The engine ``mujoco``: one robot of rigid bodies in the surroundings shared by all engines.
 
 Walls, ground and all moving bodies are in MuJoCo's model for contact. Sensor rays are cast on the same map and heights
 by the project's own kernels: MuJoCo's rays cost 0.9 ms per scan against 400 boxes and 0.3 s against a field of 400 x
-400 heights. MuJoCo's rays find only blocks on the ground, which those kernels do not model.
+400 heights. MuJoCo's rays are used only for blocks on the ground, which those kernels do not model.
 """
 
 from functools import partial
@@ -42,30 +42,30 @@ from monstertruck_sim.world3d.model import (
 from monstertruck_sim.world3d.plant import RigidPlant, Steering
 
 _Shown = tuple[Obstacle, bool] | None
-"""Meaning of a spare body, and whether pictures show it: people are drawn as such; None for an unused one."""
+"""Content of a spare body, and whether pictures show it (people have their own shapes); None: unused."""
 
 
 class LevelGround:
     """Ground at height 0 everywhere."""
 
     def height(self, x: Array, y: Array) -> Array:
-        """0, of the shape of the points."""
+        """Return 0, in the shape of the points."""
         return np.zeros(np.broadcast(x, y).shape)
 
     def cast(self, xs: Array, ys: Array, zs: Array, headings: Array, rises: Array, reach: float) -> Array:
-        """Implements ``UnevenGround``."""
+        """See ``UnevenGround``."""
         with np.errstate(divide="ignore"):
             met = np.where(rises < 0.0, zs / -rises, np.inf)
         return np.where(met <= reach, met, np.inf)
 
 
 class RigidSpace(Space):
-    """``Space`` of rigid bodies: spare ones represent objects, people and other robots.
+    """``Space`` of rigid bodies; spare bodies represent obstacles, people and other robots.
 
     Args:
         footprint: footprint of the robot, in its surroundings.
-        plant: the robot, in its model.
-        ground: under everything.
+        plant: the robot in its model.
+        ground: the ground.
         name: name of the robot.
     """
 
@@ -79,7 +79,7 @@ class RigidSpace(Space):
                 self._show(f"{kind}_{i}", None)
 
     def add(self, obstacle: Obstacle) -> None:
-        """Put something into it.
+        """Add an obstacle.
 
         Raises:
             InputError: no spare body of its kind is left.
@@ -93,10 +93,10 @@ class RigidSpace(Space):
         super().add(obstacle)
 
     def set_tilt(self, tilt: TiltConfig) -> None:
-        """Lift the robot onto blocks, or put it back onto the ground.
+        """Put the robot onto blocks, or back onto the ground.
 
         Raises:
-            InputError: it is to rock, or does not stand so.
+            InputError: the tilt oscillates, or the robot cannot stand at it.
         """
         if tilt.kind == "sinusoid":
             raise InputError("tilt sinusoid: not supported with engine mujoco; expected ground or steady")
@@ -104,7 +104,7 @@ class RigidSpace(Space):
         self._plant.stand(radians(pitch), radians(roll))
 
     def follow(self) -> None:
-        """Bring the bodies to where everything is now."""
+        """Move the bodies to the current poses of the objects they represent."""
         robots: list[tuple[Obstacle, bool]] = [
             (body.outline, not isinstance(body.plant, RigidPlant)) for body in self._others()
         ]
@@ -112,7 +112,7 @@ class RigidSpace(Space):
         if not robots and not people and self._known is self.obstacles:
             return
         self._known = self.obstacles
-        # Robots of rigid bodies and people are drawn by their own shapes.
+        # Robots of rigid bodies and people are drawn with their own shapes.
         there = [(shape, True) for shape in self._known] + [(disc, False) for disc in people] + robots
         for kind, cls in (("disc", Disc), ("box", Box)):
             shown = self._shown[kind]
@@ -127,7 +127,7 @@ class RigidSpace(Space):
         return [body for body in self._scene.bodies if body.name != self._name]
 
     def _show(self, name: str, shown: _Shown) -> None:
-        """Move a spare body to an object's place; an unused one costs neither steps nor rendering."""
+        """Move a spare body to an object's pose; unused bodies cost neither integration nor rendering."""
         model, data = self._plant.model, self._plant.data
         body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
         mocap, geom = model.body_mocapid[body], model.body_geomadr[body]
@@ -157,8 +157,8 @@ class RigidSweep:
 
     Args:
         plant: the robot, in its model.
-        cast: horizontal ranges to walls, things, people and robots.
-        ground: under them.
+        cast: horizontal ranges to walls, obstacles, people and robots.
+        ground: the ground.
         config: configuration of the lidar.
     """
 
@@ -167,7 +167,7 @@ class RigidSweep:
         self._blocks = has_blocks(plant)
 
     def __call__(self, poses: Array, beams: Beams | None, times_ns: NDArray[np.int64], reach: float) -> Array:
-        """Implements ``Sweep``."""
+        """See ``Sweep``."""
         x, y, yaw, pitch, roll, z = poses
         config = self._config
         beams = turned(LEVEL_BEAMS if beams is None else beams, pitch, roll)
@@ -185,7 +185,7 @@ class RigidSweep:
 
 
 class RigidEchoes:
-    """``Solids``: the blocks on the ground, met by rays of sonars that lean with the body.
+    """``Solids``: blocks on the ground, for the rays of sonars that tilt with the body.
 
     Args:
         plant: the robot, in its model.
@@ -197,7 +197,7 @@ class RigidEchoes:
         self._blocks = has_blocks(plant)
 
     def __call__(self, yaw: float, pitch: float, roll: float, z: float) -> Caster | None:
-        """Implements ``Solids``."""
+        """See ``Solids``."""
         if not self._blocks:
             return None
         height = z + self._height
@@ -217,7 +217,7 @@ class RigidEchoes:
 
 
 def has_blocks(plant: RigidPlant) -> bool:
-    """Whether objects stand on the ground that the kernels of walls and heights do not model."""
+    """Whether blocks are on the ground, which the kernels of walls and heights do not model."""
     return bool((plant.model.geom_group == Group.BLOCKS).any())
 
 
@@ -228,13 +228,13 @@ def to_blocks(plant: RigidPlant, places: Array, ways: Array, reach: float) -> Ar
         plant: the robot, in its model.
         places: origins of the beams, (n, 3) (m); neighbours in the array are neighbours in space.
         ways: directions as unit vectors, (n, 3).
-        reach: m.
+        reach: maximum distance (m).
     """
     count = len(ways)
     group = np.array([i == Group.BLOCKS for i in range(mujoco.mjNGROUP)], dtype=np.uint8)
     geoms, met = np.empty(count, dtype=np.int32), np.empty(count)
     ranges = np.full(count, np.inf)
-    rays = 64  # beams that are cast at blocks from one origin; each is corrected for its own
+    rays = 64  # beams cast from one origin at blocks; each range is corrected for its own origin
     for first in range(0, count, rays):
         part = slice(first, min(first + rays, count))
         size = part.stop - part.start
@@ -249,7 +249,7 @@ def to_blocks(plant: RigidPlant, places: Array, ways: Array, reach: float) -> Ar
 
 
 def drive_line(truck: SimTruckConfig, parts: Mechanics) -> DriveLine:
-    """Drive line of a body.
+    """Return the drive line of a body.
 
     A truck has one motor for four wheels: open differentials in both axles and a rigid transfer case between them. A
     car drives its rear wheels through a differential, a skid-steer robot the coupled wheels of each side or every wheel
@@ -281,7 +281,7 @@ def drive_line(truck: SimTruckConfig, parts: Mechanics) -> DriveLine:
 
 
 def wheel_steering(truck: SimTruckConfig) -> Steering:
-    """Convert servo angles to wheel angles, by the truck's fitted linkage or a car's ideal one."""
+    """Return the conversion of servo angles to wheel angles: the truck's fitted linkage or a car's ideal one."""
     chassis = truck.chassis()
     linkage = chassis.linkage
     if truck.body.kind == "truck" and isinstance(linkage, LinkedAxles):
@@ -293,11 +293,11 @@ def wheel_steering(truck: SimTruckConfig) -> Steering:
 
 
 def rigid(config: WorldConfig, footprint: PlanOutline, start: Pose2, *, lidar: bool) -> Engine:
-    """One robot of rigid bodies, with or without a lidar on its joints.
+    """Create a robot of rigid bodies, with or without a lidar on its joints.
 
     Raises:
-        InputError: a file of the world is not there or does not fit, there are too many people, or the robot cannot
-            stand where it begins.
+        InputError: a file of the world is missing or invalid, there are too many people, or the robot cannot stand at
+            its start pose.
     """
     scene = footprint.scene
     if len(scene.people) > SPARE:

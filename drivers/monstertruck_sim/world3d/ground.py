@@ -38,16 +38,16 @@ Bounds = tuple[float, float, float, float]
 def ground_heights(
     config: WorldConfig, profile: Profile | None, bounds: Bounds, starts: Sequence[Pose2]
 ) -> HeightGrid | None:
-    """Sum of the map's profile, rough patches, features and picture; None: level.
+    """Return the sum of the map's profile, rough patches, features and height image; None: level.
 
     Args:
         config: configuration of the world.
         profile: profile of the map.
         bounds: bounds of the map.
-        starts: starts of all robots of the world, for they stand on the same ground.
+        starts: start poses of all robots of the world, which share the ground.
 
     Raises:
-        InputError: no such picture.
+        InputError: the height image does not exist.
     """
     shaped = any(not isinstance(feature, UprightStep | Rubble) for feature in config.ground)
     if profile is None and not config.rough and not shaped and config.height_image is None:
@@ -73,14 +73,16 @@ def _height(feature: GroundFeature, x: Array, y: Array, starts: Sequence[Pose2])
     if isinstance(feature, Ditch):
         c, s = cos(feature.yaw), sin(feature.yaw)
         along, across = c * (x - feature.x) + s * (y - feature.y), c * (y - feature.y) - s * (x - feature.x)
-        side = np.clip(2.0 * (1.0 - abs(across) / (feature.width / 2)), 0.0, 1.0)  # the middle half is its bottom
+        side = np.clip(
+            2.0 * (1.0 - abs(across) / (feature.width / 2)), 0.0, 1.0
+        )  # the bottom is the middle half of the width
         end = np.clip((feature.length / 2 - abs(along)) / (feature.width / 4), 0.0, 1.0)
         return np.asarray(-feature.depth * side * end)
     return np.zeros_like(x)
 
 
 def _hills(feature: Hills, x: Array, y: Array, starts: Sequence[Pose2]) -> Array:
-    """White noise without waves shorter than ``wavelength``, level around the starts."""
+    """Return white noise without wavelengths below ``wavelength``, level around the starts."""
     noise = generator(feature.seed, GROUND_STREAM).standard_normal(x.shape)
     spectrum = np.fft.rfft2(noise)
     fy, fx = np.fft.fftfreq(x.shape[0], HEIGHT_STEP), np.fft.rfftfreq(x.shape[1], HEIGHT_STEP)
@@ -100,7 +102,7 @@ def _pictured(config: HeightImage) -> HeightGrid:
 
 
 def blocks(features: Sequence[GroundFeature], heights: HeightGrid | None) -> tuple[Block, ...]:
-    """Steps and stones, each standing a little in the ground."""
+    """Return steps and stones, each slightly embedded in the ground."""
     found: list[Block] = []
     for feature in features:
         if isinstance(feature, UprightStep):
@@ -130,13 +132,13 @@ def _standing(
 
 
 def scenery(path: Path) -> tuple[list[ET.Element], list[ET.Element]]:
-    """Assets, and bodies and geometries, of an MJCF file; angles in radians, files of assets by their whole names.
+    """Read assets, and bodies and geometries, of an MJCF file; angles in radians, asset files with full paths.
 
     Its angles are in degrees, and its asset files relative to it, unless its ``compiler`` element specifies otherwise
     (MuJoCo XML reference, element compiler).
 
     Raises:
-        InputError: it is not an MJCF file, contains a moving body or unsupported elements: classes of defaults,
+        InputError: it is not an MJCF file, contains a moving body, or uses unsupported features: default classes or
             another sequence of Euler angles.
     """
     expected = "MJCF (sim.world.mjcf)"

@@ -1,4 +1,4 @@
-"""Height of the ground on a grid, and hits of beams on it: the triangles of MuJoCo's height field, by numba.
+"""Height of the ground on a grid, and beam intersections with it: the triangles of MuJoCo's height field, in numba.
 
 MuJoCo's own rays test every cell of the field below a beam's bounding box: 0.4 ms per beam on 400 x 400 points, a third
 of a second per scan. This module's rays walk along the beam from cell to cell.
@@ -15,11 +15,11 @@ from monstertruck_kinematics.elementary import Array
 
 @dataclass(frozen=True, slots=True)
 class HeightGrid:
-    """Heights at the points of a square grid; beyond its edge the edge's height.
+    """Heights at the points of a square grid; beyond the edge, the height at the edge.
 
     Args:
         z: heights, (rows, columns), row 0 at the lowest y (m).
-        resolution: distance of two points (m).
+        resolution: spacing of the points (m).
         origin: x, y of the first point (m).
     """
 
@@ -51,15 +51,15 @@ class HeightGrid:
             ys: y of the origins.
             zs: z of the origins.
             headings: directions in the plane, (n,) (rad).
-            rises: metres upwards a metre of horizontal distance, (n,).
-            reach: longest horizontal distance (m).
+            rises: rise per metre of horizontal distance, (n,).
+            reach: maximum horizontal distance (m).
         """
         return np.asarray(_cast(self.z, self.resolution, *self.origin, xs, ys, zs, headings, rises, reach))
 
 
 @njit(cache=True)
 def _height(z: Array, column: float, row: float) -> float:
-    """At a point in cells; each cell is two triangles that meet on the diagonal from (0, 0) to (1, 1)."""
+    """Return the height at a point in cells; the diagonal from (0, 0) to (1, 1) splits each cell into triangles."""
     rows, columns = z.shape
     column, row = min(max(column, 0.0), columns - 1.0), min(max(row, 0.0), rows - 1.0)
     c, r = min(int(column), columns - 2), min(int(row), rows - 2)
@@ -82,7 +82,7 @@ def _heights(z: Array, resolution: float, x0: float, y0: float, xs: Array, ys: A
 
 @njit(cache=True)
 def _next(value: float, step: float) -> float:
-    """Distance along a beam to the next line of a family at integer values; ``step`` is its change a unit of length."""
+    """Return the distance along a beam to the next integer grid line; ``step`` is the change per unit of length."""
     if abs(step) < 1e-12:
         return inf
     line = floor(value + 1e-9) + 1.0 if step > 0.0 else -floor(-value + 1e-9) - 1.0
@@ -94,7 +94,7 @@ def _cast(
     z: Array, resolution: float, x0: float, y0: float, xs: Array, ys: Array, zs: Array, headings: Array, rises: Array,
     reach: float,
 ) -> Array:  # fmt: skip
-    """Between two lines of the grid (columns, rows, diagonals) the ground under a beam is straight: so is the gap."""
+    """Intersect beams with the ground, whose gap to a beam is linear between two grid lines."""
     found = np.empty(len(xs))
     top = z.max()
     for i in range(len(xs)):

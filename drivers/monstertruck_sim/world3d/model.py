@@ -1,4 +1,4 @@
-"""The MuJoCo model: MJCF of a robot's description, of its drive line, and of the ground and walls around it.
+"""The MuJoCo model: MJCF of a robot, its drive line, and the ground and walls around it.
 
 Geometries are grouped: ground, walls, blocks on the ground, the robot, and bodies that move or can be added.
 """
@@ -24,13 +24,13 @@ from monstertruck_sim.world.config import RoofTag, TagConfig
 from monstertruck_sim.world3d.heights import HeightGrid
 
 TIMESTEP: Final = 0.002
-"""s."""
+"""Time step (s)."""
 SPARE: Final = 24
-"""Discs, and boxes, that can be put into a world while it runs; people and other robots are among them."""
+"""Number of spare discs, and of spare boxes, for a running world; people and other robots use them as well."""
 PARKED: Final = -50.0
 """Height of unused spare bodies (m)."""
 SUPPORTS: Final = tuple(f"support_{i}" for i in range(4))
-"""Blocks that can be put under wheels."""
+"""Blocks that can be placed under wheels."""
 TALL: Final = 0.6
 """Height of objects added to a world (m)."""
 
@@ -38,26 +38,26 @@ log = logging.getLogger(__name__)
 
 
 class Warnings:
-    """Warnings of MuJoCo, which it would otherwise write to a file in the current folder."""
+    """Collects MuJoCo's warnings, which it would otherwise write to a file in the current folder."""
 
     count: ClassVar[int] = 0
 
     @classmethod
     def take(cls, text: str) -> None:
-        """Count one and log it."""
+        """Count and log a warning."""
         cls.count += 1
         log.warning("MuJoCo: %s", " ".join(text.split()))
 
 
 class TouchBits(NamedTuple):
-    """Bits of contact: two geometries touch where a bit of the type of one is in the affinity of the other."""
+    """Contact bits: two geometries collide if the type of one shares a bit with the affinity of the other."""
 
     kind: int
     affinity: int
 
     @property
     def attributes(self) -> dict[str, str]:
-        """Attributes of a geometry."""
+        """MJCF attributes of a geometry."""
         return {"contype": f"{self.kind}", "conaffinity": f"{self.affinity}"}
 
 
@@ -65,10 +65,10 @@ UNTOUCHED: Final = TouchBits(0, 0)
 CARRIES: Final = TouchBits(5, 2)
 """The ground."""
 UPRIGHT: Final = TouchBits(9, 2)
-"""Walls and objects."""
+"""Walls and obstacles."""
 _TOUCHES: Final = {"all": TouchBits(2, 1), "ground": TouchBits(0, 4), "walls": TouchBits(0, 8)}
 _TYRE: Final = "0.01 1"
-"""Time constant (s) and damping ratio of the robot's contact, which gives 0.3 mm under its weight."""
+"""Time constant (s) and damping ratio of the tyre contact, which yields 0.3 mm under the robot's weight."""
 
 
 class Group(IntEnum):
@@ -80,21 +80,21 @@ class Group(IntEnum):
     ROBOT = 3
     MOVING = 4
     SIGNS = 5
-    """Tags, which have no contact."""
+    """Tags, without contact."""
 
 
 @dataclass(frozen=True, slots=True)
 class DriveLine:
-    """Mechanics between the shafts and the wheels.
+    """Mechanics between shafts and wheels.
 
     Args:
-        shafts: spin joints of the wheels of every driven shaft. Open differentials connect them: the shaft turns with
-            the mean speed of its wheels, and all get the same torque.
+        shafts: spin joints of the wheels of every driven shaft. Open differentials connect them: the shaft turns at the
+            mean speed of its wheels, and all wheels receive the same torque.
         locked: groups of spin joints whose means turn equally (a rigid transfer case).
         stiffness: stiffness of the wind-up between a shaft and the mean of its wheels, Nm/rad.
-        damping: Nm s/rad.
+        damping: damping of the wind-up (Nm s/rad).
         clutch: maximum total torque of a shaft's wheels (Nm).
-        turns: turns of a spin joint a turn of its wheel, where it is not 1.
+        turns: turns of a spin joint per turn of its wheel, if not 1.
     """
 
     shafts: tuple[tuple[str, ...], ...]
@@ -107,7 +107,7 @@ class DriveLine:
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """A box on the ground that wheels can climb: middle, sides and yaw; m and rad."""
+    """A box on the ground that wheels can climb: centre, sides (m) and yaw (rad)."""
 
     x: float
     y: float
@@ -121,16 +121,16 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class StaticScene:
-    """Everything around the robot that does not move.
+    """Static part of the robot's surroundings.
 
     Args:
         walls: rectangles of solid map cells, (n, 4): minimum x, minimum y, maximum x, maximum y (m).
-        wall_height: over the ground (m).
+        wall_height: height of the walls above the ground (m).
         heights: heights of the ground; None: level at 0.
-        blocks: on it.
+        blocks: blocks on the ground.
         scenery: assets, and bodies and geometries, of another MJCF file.
-        tags: on the walls.
-        roof: on the robot.
+        tags: tags on the walls.
+        roof: tag on the robot.
     """
 
     walls: Array
@@ -143,7 +143,7 @@ class StaticScene:
 
 
 EMPTY: Final = StaticScene(np.zeros((0, 4)), TALL, None)
-"""Level ground without anything."""
+"""Level ground without walls or blocks."""
 
 
 def rectangles(solid: NDArray[np.bool_], resolution: float, origin: tuple[float, float], longest: int = 80) -> Array:
@@ -153,7 +153,7 @@ def rectangles(solid: NDArray[np.bool_], resolution: float, origin: tuple[float,
         solid: (rows, columns), row 0 lowest y.
         resolution: side of a cell (m).
         origin: origin of the lower left corner (m).
-        longest: side of a rectangle, cells: on uneven ground a wall follows it piece by piece.
+        longest: maximum side of a rectangle (cells): on uneven ground, short pieces of a wall follow it.
     """
     left = solid.copy()
     found: list[tuple[int, int, int, int]] = []
@@ -179,13 +179,13 @@ def _first(row: NDArray[np.bool_], start: int) -> int | None:
 
 
 def mjcf(description: Description, drive: DriveLine, friction: float, scene: StaticScene) -> str:
-    """The whole model as text.
+    """Return the whole model as MJCF text.
 
     Args:
         description: description of the robot; its first link moves freely.
         drive: its drive line.
-        friction: between tyres and everything.
-        scene: around it.
+        friction: friction coefficient of the tyres.
+        scene: static surroundings.
     """
     root = Element("mujoco", model=description.name)
     SubElement(root, "compiler", angle="radian", boundmass="0", boundinertia="0", autolimits="true")
@@ -202,7 +202,7 @@ def mjcf(description: Description, drive: DriveLine, friction: float, scene: Sta
     visual = SubElement(root, "visual")
     SubElement(visual, "global", offwidth="1280", offheight="960", fovy="60")
     SubElement(visual, "map", znear="0.005", zfar="100")
-    # Only a lamp near by would need sides of boxes in several parts: software draws each of them three times.
+    # Only a nearby lamp would need boxes with subdivided sides, and software rendering draws each part three times.
     SubElement(visual, "quality", shadowsize="1024", offsamples="0", numquads="1")
     SubElement(visual, "headlight", ambient="0.35 0.35 0.35", diffuse="0.25 0.25 0.25", specular="0 0 0")
     default = SubElement(root, "default")
@@ -236,10 +236,10 @@ def mjcf(description: Description, drive: DriveLine, friction: float, scene: Sta
 
 
 def load(description: Description, drive: DriveLine, friction: float, scene: StaticScene) -> mujoco.MjModel:
-    """``mjcf`` compiled, with the heights in it.
+    """Compile ``mjcf`` and fill in the heights.
 
     Raises:
-        InputError: the scenery of another file does not fit.
+        InputError: the scenery of another file does not compile.
     """
     mujoco.set_mju_user_warning(Warnings.take)
     try:
@@ -288,7 +288,7 @@ def _materials(asset: Element) -> None:
 
 
 def _relief(heights: HeightGrid) -> tuple[float, float]:
-    """Return the lowest height, and the rise from there to the highest (m); a height field is not flat."""
+    """Return the lowest height and the relief above it (m), which must not be 0 for a height field."""
     low, high = float(heights.z.min()), float(heights.z.max())
     return low, max(high - low, 1e-3)
 
@@ -325,7 +325,7 @@ def _walls(world: Element, scene: StaticScene) -> None:
 
 
 def _tags(asset: Element, world: Element, tags: Sequence[TagConfig]) -> None:
-    """Sheets of paper on the walls; ``load`` paints them."""
+    """Add sheets of paper to the walls; ``load`` paints the tags on them."""
     for i, tag in enumerate(tags):
         right, up = tag_axes(tag.yaw, lies=tag.lies)
         _paper(asset, world, f"tag_{i}", tag.size, (tag.x, tag.y, tag.z + 0.001 * tag.lies), (*right, *up))
@@ -374,7 +374,7 @@ def _spare(world: Element) -> None:
             group = f"{Group.MOVING.value}"
             look = {**UPRIGHT.attributes, "type": shape, "size": size, "group": group, "rgba": "0.8 0.45 0.15 0"}
             SubElement(body, "geom", look, name=f"{kind}_{i}")
-    sides = 0.12, 0.12, 0.4  # m; the part of its height that is not needed is below the ground
+    sides = 0.12, 0.12, 0.4  # m; the lower part is below the ground
     for name in SUPPORTS:
         body = SubElement(world, "body", name=name, mocap="true", pos=_text(0.0, 0.0, PARKED))
         size = _text(*(side / 2 for side in sides))
@@ -418,7 +418,7 @@ def _joint(body: Element, joint: PartJoint) -> None:
     if joint.name in HEAD_JOINTS:
         element.set("armature", "0.001")
     if joint.name.endswith("_steer"):
-        # Armature of a steering servo behind its linkage, as each wheel feels it, kg m^2.
+        # Armature of a steering servo behind its linkage, as it acts on each wheel (kg m^2).
         element.set("armature", "0.002")
 
 
@@ -459,7 +459,7 @@ def _shape(body: Element, shape: Shape, name: str) -> None:
 
 
 HEAD_LAG: Final = 0.01
-"""Delay of a joint behind its turning shaft, s, caused by its damper."""
+"""Lag of a joint behind its turning shaft (s), caused by its damper."""
 
 
 def _drive(root: Element, description: Description, drive: DriveLine) -> None:
@@ -477,7 +477,7 @@ def _drive(root: Element, description: Description, drive: DriveLine) -> None:
         SubElement(equalities, "tendon", tendon1=f"case_{i}_a", tendon2=f"case_{i}_b", solref="0.01 1")
     for joint in description.joints:
         if joint.name.endswith("_steer"):
-            gains = {"kp": "60.0", "kv": "0.8"}  # Nm/rad and Nm s/rad: the linkage gives a little
+            gains = {"kp": "60.0", "kv": "0.8"}  # Nm/rad and Nm s/rad: the linkage is slightly compliant
             SubElement(actuators, "position", gains, name=joint.name, joint=joint.name)
     for joint in description.joints:
         if joint.name in HEAD_JOINTS:

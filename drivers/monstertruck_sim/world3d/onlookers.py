@@ -1,4 +1,4 @@
-"""Onlookers of a world: a camera that films the robot by the world's clock, and the ceiling cameras of a stand."""
+"""Cameras in the world that are not on a robot: one that films a robot, and the ceiling cameras of a stand."""
 
 from math import cos, sin
 from pathlib import Path
@@ -21,24 +21,25 @@ from monstertruck_sim.world3d.picture import WorldRenderer, looking_at, standing
 from monstertruck_sim.world3d.plant import RigidPlant
 
 FRAME_RATE: Final = 8
-"""Frames a second."""
+"""Frame rate (Hz)."""
 _BEHIND, _ASIDE, _ABOVE = 1.25, 0.7, 0.95
-"""Position of the camera relative to the robot (m); it swings around behind a turning robot."""
+"""Position of the camera relative to the robot (m); it swings around to stay behind a turning robot."""
 _PLAIN: Final = Image.Dither.NONE
 
 
 class Film:
-    """Frames of one robot; to be used on the loop of a virtual clock, for a frame takes tens of milliseconds.
+    """Film of one robot; use it on the loop of a virtual clock, because a frame takes tens of milliseconds.
 
-    Use it as a context manager. A run that ends with an error of the robot is kept; an interrupted one leaves no file.
+    Use it as a context manager. The film of a run that ends with an error of the robot is kept; an interrupted run
+    leaves no file.
 
     Args:
-        world: with the robot.
-        clock: its time.
+        world: world with the robot.
+        clock: clock of the world.
         file: GIF file, written during the run and renamed at its end.
 
     Raises:
-        InputError: the engine has nothing to draw, or the file is not a GIF.
+        InputError: the engine cannot render, or the file is not a GIF.
         NotInstalledError: this computer has no EGL.
     """
 
@@ -53,7 +54,7 @@ class Film:
         self._pictures = MovingPicture(file, 1 / FRAME_RATE)
 
     async def run(self) -> None:
-        """Take frames until cancelled.
+        """Record frames until cancelled.
 
         Raises:
             OSError: the file cannot be written.
@@ -65,12 +66,12 @@ class Film:
             await self._clock.sleep_until(due)
 
     def take(self) -> None:
-        """One frame, of this moment."""
+        """Record one frame now."""
         now = self._clock.now()
         self._world.truth(now)
         x, y, yaw = self._plant.pose
         z = self._plant.height
-        self._heading += 0.12 * (yaw - self._heading)  # share of the remaining angle covered from frame to frame
+        self._heading += 0.12 * (yaw - self._heading)  # fraction of the remaining angle covered from frame to frame
         c, s = cos(self._heading), sin(self._heading)
         camera = x - _BEHIND * c + _ASIDE * s, y - _BEHIND * s - _ASIDE * c, z + _ABOVE
         view = looking_at(camera, (x + 0.3 * c, y + 0.3 * s, z + 0.1))
@@ -97,7 +98,7 @@ class CeilingView(RenderedView):
 
     Args:
         world: world of engine mujoco.
-        config: place, lens and noise.
+        config: pose, lens and noise.
         board: board held in front of the camera, or None.
         seed: seed of noise and board poses.
 

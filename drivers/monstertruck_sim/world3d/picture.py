@@ -1,4 +1,4 @@
-"""Pictures of the world, rendered by software without a screen (EGL)."""
+"""Images of the world, rendered in software without a screen (EGL)."""
 
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
@@ -14,19 +14,19 @@ from monstertruck_sim.world3d.model import Group
 from monstertruck_sim.world3d.plant import RigidPlant
 
 Somebody = tuple[float, float, float, float]
-"""Position, height of the ground and radius (m)."""
+"""A person: x, y, height of the ground, and radius (m)."""
 Picture = NDArray[np.uint8]
-"""(height, width, 3), red, green and blue, the top row first."""
+"""Image of shape (height, width, 3): red, green, blue; the top row first."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraPose:
-    """Viewpoint of a picture.
+    """Camera pose of an image.
 
     Args:
-        place: place of the camera (m).
-        ahead: unit vector, the axis of the picture.
-        up: unit vector, at a right angle to it.
+        place: position of the camera (m).
+        ahead: unit vector along the optical axis.
+        up: unit vector, perpendicular to it.
         field_of_view: vertical angle of view (rad).
     """
 
@@ -39,7 +39,7 @@ class CameraPose:
 def looking_at(
     place: tuple[float, float, float], at: tuple[float, float, float], field_of_view: float = 1.0
 ) -> CameraPose:
-    """An upright camera aimed at a point."""
+    """Return the pose of an upright camera aimed at a point."""
     ahead = np.subtract(at, place) / np.linalg.norm(np.subtract(at, place))
     left = np.cross((0.0, 0.0, 1.0), ahead)
     left /= np.linalg.norm(left)
@@ -48,17 +48,17 @@ def looking_at(
 
 
 def standing(people: Iterable[tuple[float, float, float]], ground: Callable[[float, float], float]) -> list[Somebody]:
-    """People, x, y and radius, on the ground whose height is given at a place; m."""
+    """Return people (x, y and radius, m) with the height of the ground below them (m)."""
     return [(x, y, ground(x, y), radius) for x, y, radius in people]
 
 
 class WorldRenderer:
-    """Draws a model; to be used in one thread.
+    """Renders a model; use it in a single thread.
 
     Args:
         model: MuJoCo model.
-        width: width of the pictures (pixels).
-        height: pixels.
+        width: width of the images (pixels).
+        height: height of the images (pixels).
 
     Raises:
         NotInstalledError: this computer has no EGL.
@@ -93,7 +93,7 @@ class WorldRenderer:
         people: Sequence[Somebody] = (),
         robots: Sequence[Plant] = (),
     ) -> Picture:
-        """The world at the state of ``data``, and who is there."""
+        """Draw the world in the state of ``data``, with people and other robots."""
         self.arrange(data, camera_pose, people=people, robots=robots)
         return self.render()
 
@@ -106,21 +106,21 @@ class WorldRenderer:
         robots: Sequence[Plant] = (),
         hidden: Collection[Group] = (),
     ) -> None:
-        """Update the scene to draw; needs no particular thread.
+        """Update the scene to draw; may run in any thread.
 
         Args:
             data: state of the world.
-            camera_pose: from where.
-            people: who is there.
+            camera_pose: pose of the camera.
+            people: people in the world.
             robots: other robots than the model's; rigid bodies are drawn with their pose and steering.
-            hidden: groups that are left out.
+            hidden: omitted groups.
         """
         self._option.geomgroup[:] = [group in list(Group) and group not in hidden for group in range(mujoco.mjNGROUP)]
         camera = mujoco.MjvCamera()
         mujoco.mjv_updateScene(
             self._model, data, self._option, None, camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
         )
-        # Hills take shadows and cast none: drawn twice instead of three times, for the slopes are gentle.
+        # Hills receive shadows but cast none: they are drawn twice instead of three times, as their slopes are gentle.
         for geom in self._scene.geoms[: self._scene.ngeom]:
             if geom.type == mujoco.mjtGeom.mjGEOM_HFIELD:
                 geom.category = mujoco.mjtCatBit.mjCAT_DECOR
@@ -140,14 +140,14 @@ class WorldRenderer:
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = True
 
     def render(self) -> Picture:
-        """Draw the scene; only in the thread that made the renderer."""
+        """Render the scene; only in the thread that created the renderer."""
         self._gl.make_current()
         mujoco.mjr_render(self._view, self._scene, self._context)
         mujoco.mjr_readPixels(self._pixels, None, self._view, self._context)
         return self._pixels[::-1].copy()
 
     def _add_person(self, x: float, y: float, z: float, radius: float) -> None:
-        """Legs, trunk and head of a person who stands at a place."""
+        """Add legs, trunk and head of a person at a position."""
         parts = (
             (mujoco.mjtGeom.mjGEOM_CYLINDER, (0.8 * radius, 0.4, 0.0), 0.4, (0.2, 0.24, 0.36, 1.0)),
             (mujoco.mjtGeom.mjGEOM_CYLINDER, (radius, 0.32, 0.0), 1.12, (0.6, 0.24, 0.2, 1.0)),
@@ -157,7 +157,7 @@ class WorldRenderer:
             self._add(kind, np.array(size), np.array((x, y, z + middle)), np.eye(3).ravel(), np.array(colour))
 
     def _add_robot(self, robot: RigidPlant) -> None:
-        """Its visible geometries where they are."""
+        """Add the robot's visible geometries at their poses."""
         model, data = robot.model, robot.data
         for geom in np.flatnonzero((model.geom_group == Group.ROBOT) & (model.geom_rgba[:, 3] > 0.0)):
             look = model.geom_type[geom], model.geom_size[geom], data.geom_xpos[geom], data.geom_xmat[geom]
@@ -172,7 +172,7 @@ class WorldRenderer:
             self._scene.ngeom += 1
 
     def close(self) -> None:
-        """Give the context back."""
+        """Release the EGL context."""
         self._context.free()
         self._gl.free()
 

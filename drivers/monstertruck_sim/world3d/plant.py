@@ -43,14 +43,14 @@ Steering = Callable[[Sequence[float]], Sequence[float]]
 
 
 class _Tyres(NamedTuple):
-    """The give of all tyres."""
+    """Compliance of all tyres."""
 
     joints: tuple[tuple[int, int, int], ...]
-    """Index of the position, of the speed, and of the wheel speed of each among all joints."""
+    """For each wheel, the indices of position, speed and wheel speed among all joints."""
     spring: float
     """Spring rate (N/m)."""
     share: float
-    """Share of the relaxation length that a wheel rolls in one step, per rad/s."""
+    """Fraction of the relaxation length that a wheel rolls in one step, per rad/s."""
 
 
 def _tyres(model: mujoco.MjModel, parts: Mechanics, radius: float) -> _Tyres | None:
@@ -66,17 +66,17 @@ def _tyres(model: mujoco.MjModel, parts: Mechanics, radius: float) -> _Tyres | N
 
 
 class RigidPlant(Plant):
-    """One robot among rigid bodies.
+    """One robot of rigid bodies.
 
     Args:
         config: true parameters.
-        battery: the pack.
+        battery: battery model parameters.
         start: pose of the geometric centre.
         model: MuJoCo model of robot and surroundings.
-        drive: its drive line.
+        drive: drive line of the robot.
         steering: converts servo angles to wheel angles.
-        ground: height under a point of the map (m).
-        parts: its mechanics.
+        ground: returns the height of the ground at a point of the map (m).
+        parts: masses and springs.
     """
 
     STEP_NS: ClassVar[int] = round(TIMESTEP * 1e9)
@@ -98,16 +98,16 @@ class RigidPlant(Plant):
         self.data = mujoco.MjData(model)
         self._drive, self._steers, self.ground = drive, steering, ground
         self.before_steps: Callable[[], None] = lambda: None
-        """Moves the bodies around the robot to their current poses."""
+        """Called before integration; moves the bodies around the robot to their current poses."""
         count = len(self.shafts)
         self._first_shaft = model.nu - count
         self._wound = [0.0] * count
-        """Wind-up of each shaft, rad, mean of its wheels."""
+        """Wind-up of each shaft (rad), as the mean of its wheels."""
         self._head = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name) for name in HEAD_JOINTS]
         self._head_shafts = np.zeros(len(self._head))
         """Angles of the stabiliser's shafts at the latest step (rad)."""
         self._rolling = [model.jnt_qposadr[i] for i in range(model.njnt) if model.joint(i).name.endswith("_rollers")]
-        """Balls in place of wheels with rollers; their axis across the rollers stays level."""
+        """Balls in place of wheels with rollers; the axis across the rollers stays horizontal."""
         self._tyres = _tyres(model, parts, config.wheel_radius)
         self._deflection = [0.0] * (0 if self._tyres is None else len(self._tyres.joints))
         """Longitudinal and lateral deflection of the tyres (m)."""
@@ -139,15 +139,15 @@ class RigidPlant(Plant):
         return -float(self.data.actuator_force[self._head[joint]])
 
     def integrate(self, time_ns: int) -> None:
-        """``advance`` of this robot alone."""
+        """Integrate this robot alone; see ``advance``."""
         self.before_steps()
         super().integrate(time_ns)
 
     def carry(self, pose: Pose2) -> None:
-        """Put the robot down elsewhere at rest; sensors see no motion between the two places.
+        """Move the robot to another pose, at rest; sensors see no motion between the two poses.
 
         Raises:
-            InputError: it cannot stand there, and is where it was.
+            InputError: the robot cannot stand there, and stays in place.
         """
         before = self._pose
         try:
@@ -159,12 +159,12 @@ class RigidPlant(Plant):
         self._remember()
 
     def stand(self, pitch: float, roll: float) -> None:
-        """Lift it onto blocks that tilt it so, rad, or off them (0, 0); it keeps its place, and comes to rest there.
+        """Put the robot onto blocks that tilt it (rad), or off them (0, 0); it comes to rest at the same position.
 
-        Without a tilt, a robot that stands on no blocks is unchanged.
+        Without a tilt, a robot that is not on blocks is unchanged.
 
         Raises:
-            InputError: the robot cannot stand at this tilt, and is unchanged.
+            InputError: the robot cannot stand at this tilt; it is unchanged.
         """
         if not any((pitch, roll, *self._on_blocks)):
             return
@@ -181,7 +181,7 @@ class RigidPlant(Plant):
             raise
 
     def _support(self, pose: Pose2) -> float:
-        """Turn the robot to its tilt, and put blocks below its wheels; return the height of its base then (m)."""
+        """Tilt the robot and put blocks below its wheels; return the height of its base (m)."""
         model, data = self.model, self.data
         x, y, yaw = pose
         (cy, sy), (cp, sp), (cr, sr) = ((cos(angle / 2), sin(angle / 2)) for angle in (yaw, *self._on_blocks))
@@ -210,10 +210,10 @@ class RigidPlant(Plant):
         return ground + base
 
     def _put(self, pose: Pose2) -> None:
-        """Let it settle on its springs at a pose, held in its place.
+        """Let the robot settle on its springs at a pose, held in x, y and yaw.
 
         Raises:
-            InputError: it does not: something of the ground or of an MJCF file reaches into it.
+            InputError: the robot does not settle, because the ground or a geometry of an MJCF file penetrates it.
         """
         data = self.data
         around = data.mocap_pos.copy(), data.mocap_quat.copy()
@@ -256,7 +256,10 @@ class RigidPlant(Plant):
         mujoco.mj_step(self.model, self.data)
         if Warnings.count != self._warned:
             self._require_stable()
-        places, speeds = self.data.qpos.tolist(), self.data.qvel.tolist()  # far faster than to pick from the arrays
+        places, speeds = (
+            self.data.qpos.tolist(),
+            self.data.qvel.tolist(),
+        )  # far faster than element access on the arrays
         self._roll(places, speeds)
         before = self._velocity
         self._read(places, speeds)
@@ -268,10 +271,10 @@ class RigidPlant(Plant):
         return any(self.data.warning[which].number for which in _UNSTABLE)
 
     def _require_stable(self) -> None:
-        """Continue after a warning, which may come from another robot's model.
+        """Check the state after a warning, which may come from another robot's model.
 
         Raises:
-            CommandFailedError: numbers of this one grew beyond all bounds.
+            CommandFailedError: the state of this robot has diverged.
         """
         self._warned = Warnings.count
         if self._unstable():
@@ -279,7 +282,7 @@ class RigidPlant(Plant):
             raise CommandFailedError(f"the simulation of the robot at ({x:.2f}, {y:.2f}) became unstable")
 
     def _roll(self, places: list[float], speeds: list[float]) -> None:
-        """Tyres deform where they touch the ground; rolling replaces the contact by a fresh part of the tyre.
+        """Update the deflection of the tyres at the contact; rolling replaces the deflected part of the tyre.
 
         Their deflection d follows d' = u' - |v| d / relaxation, u' being the slip of the rolling wheel: the force
         settles at ``tyre_stiffness`` times the slip ratio, or the tangent of the slip angle, and dry friction bounds
@@ -327,7 +330,7 @@ class RigidPlant(Plant):
         return pulls
 
     def _read(self, places: list[float], speeds: list[float]) -> None:
-        """Pose, twist and rates of the base, whose numbers are the first."""
+        """Read pose, twist and rates of the base, which come first in the state."""
         x, y, z, qw, qx, qy, qz = places[:7]
         forward_x, forward_y = 1.0 - 2.0 * (qy * qy + qz * qz), 2.0 * (qx * qy + qw * qz)
         down = 2.0 * (qx * qz - qw * qy)
@@ -347,7 +350,7 @@ class RigidPlant(Plant):
         self._velocity = vx, vy, vz
 
     def _feel(self, before: Xyz) -> None:
-        """The acceleration of a step, from the velocity before it, through the sensor's filter."""
+        """Compute the acceleration of a step, from the velocity before it, through the sensor's filter."""
         ax, ay, az = ((now - then) / TIMESTEP for now, then in zip(self._velocity, before, strict=True))
         c, s = cos(self._pose[2]), sin(self._pose[2])
         # 0.05: time constant of an accelerometer's mount and filter, s
@@ -360,7 +363,7 @@ class RigidPlant(Plant):
         )
 
     def _touch(self) -> None:
-        """Walls, objects and people stop the robot; ground and blocks carry it."""
+        """Detect contacts: walls, obstacles and people stop the robot; ground and blocks carry it."""
         solid = self._solid
         if self.data.ncon and any(solid[a] or solid[b] for a, b in self.data.contact.geom.tolist()):
             # 0.01: minimum speed of a collision, m/s
