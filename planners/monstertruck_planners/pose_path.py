@@ -1,9 +1,11 @@
 """A path as poses in the order in which they are driven: routes, elastic bands, planners' answers."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +13,9 @@ from numpy.typing import NDArray
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.plan import Path, Steering
+
+CUSP_REACHED: Final = 0.1
+"""Nearer than this to a cusp of its band the truck continues with what follows (m)."""
 
 
 @dataclass(frozen=True)
@@ -121,3 +126,29 @@ def stops(directions: Array, steering: Sequence[Steering]) -> NDArray[np.bool_]:
 def _must_stand(before: Steering, after: Steering) -> bool:
     """Whether the axles turn so far between two different ways of steering that the robot has to stand meanwhile."""
     return "crab" in (before, after) and "hybrid" not in (before, after)
+
+
+def pose_distance(a: Array, b: Array, reach: float = 0.3) -> Array:
+    """Return the distance of poses (..., 3): metres plus ``reach`` times the angle between them."""
+    away: Array = np.hypot(a[..., 0] - b[..., 0], a[..., 1] - b[..., 1])
+    turned = np.abs(np.remainder(a[..., 2] - b[..., 2] + math.pi, math.tau) - math.pi)
+    return np.asarray(away + reach * turned)
+
+
+def nearest_pose(band: PosePath, pose: Array) -> int:
+    """Return the band's pose nearest to the truck, not beyond a cusp that the truck has not reached."""
+    for begin, end in direction_runs(band.directions):
+        at = begin + int(np.argmin(pose_distance(band.poses[begin:end], pose)))
+        last = band.poses[end - 1]
+        if end == len(band.poses) or math.hypot(last[0] - pose[0], last[1] - pose[1]) > CUSP_REACHED:
+            return at
+    return 0
+
+
+def direction_runs(directions: Array) -> Iterator[tuple[int, int]]:
+    """Index ranges of one direction; the pose at a cusp, which ends one, also begins the next one."""
+    cuts = [*np.flatnonzero(np.diff(directions)).tolist(), len(directions) - 1]
+    begin = 0
+    for cut in cuts:
+        yield begin, cut + 1
+        begin = cut

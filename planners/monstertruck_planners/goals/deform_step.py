@@ -26,11 +26,11 @@ from monstertruck_planners.collision import (
 )
 from monstertruck_planners.goals.config import WindowConfig
 from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, Setup, explained_within
-from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, nearest_pose, pose_distance
+from monstertruck_planners.local.api import LocalPlan, LocalPlannerState
 from monstertruck_planners.local.catalog import make_local_planner
 from monstertruck_planners.local.config import RsbandConfig, TebConfig
 from monstertruck_planners.local.people import PeopleTracker, Walker, meets
-from monstertruck_planners.pose_path import PosePath
+from monstertruck_planners.pose_path import PosePath, nearest_pose, pose_distance
 from monstertruck_planners.route.api import Vehicle, make_planner, warm_up
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.motion import moved

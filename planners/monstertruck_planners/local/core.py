@@ -14,17 +14,10 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import points_relative
 from monstertruck_planners.collision import DistanceField
 from monstertruck_planners.collision_kernels import FieldData, FootprintData, safe_distance
-from monstertruck_planners.local.api import (
-    CUSP_REACHED,
-    LocalPlan,
-    LocalPlannerState,
-    direction_runs,
-    nearest_pose,
-    pose_distance,
-)
+from monstertruck_planners.local.api import LocalPlan, LocalPlannerState
 from monstertruck_planners.local.config import LocalPlannerConfig
 from monstertruck_planners.local.elastic_band import CoveringDiscs, clearance, cover_footprint
-from monstertruck_planners.pose_path import PosePath
+from monstertruck_planners.pose_path import CUSP_REACHED, PosePath, direction_runs, nearest_pose, pose_distance
 from monstertruck_planners.route.api import RouteMap, Vehicle
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.hybrid import RESOLUTIONS, HybridPlanner

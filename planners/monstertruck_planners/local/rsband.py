@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import DistanceField
-from monstertruck_planners.local.api import CUSP_REACHED, LocalPlan, LocalPlannerState, direction_runs, pose_distance
+from monstertruck_planners.local.api import LocalPlan, LocalPlannerState
 from monstertruck_planners.local.config import RsbandConfig
 from monstertruck_planners.local.core import (
     PATH_CUSP_REACHED,
@@ -24,7 +24,7 @@ from monstertruck_planners.local.core import (
     starting_at,
 )
 from monstertruck_planners.local.elastic_band import band_parameters, relax_band
-from monstertruck_planners.pose_path import PosePath
+from monstertruck_planners.pose_path import CUSP_REACHED, PosePath, direction_runs, pose_distance
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.motion import MotionPath, joined
 from monstertruck_schemas.reasons import Reason

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import DistanceField
 from monstertruck_planners.collision_kernels import FieldData
-from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, direction_runs
+from monstertruck_planners.local.api import LocalPlan, LocalPlannerState
 from monstertruck_planners.local.config import TebConfig
 from monstertruck_planners.local.core import (
     LocalPlannerCore,
@@ -34,7 +34,7 @@ from monstertruck_planners.local.core import (
     starting_at,
 )
 from monstertruck_planners.local.elastic_band import CoveringDiscs, band_parameters, distance_and_gradient, relax_band
-from monstertruck_planners.pose_path import PosePath
+from monstertruck_planners.pose_path import PosePath, direction_runs
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.motion import MotionPath
 from monstertruck_schemas.reasons import Reason

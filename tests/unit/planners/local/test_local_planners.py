@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from monstertruck_planners.collision import DistanceField
-from monstertruck_planners.local.api import LocalPlannerState, nearest_pose
+from monstertruck_planners.local.api import LocalPlannerState
 from monstertruck_planners.local.catalog import LOCAL_PLANNERS, make_local_planner
 from monstertruck_planners.local.config import LocalPlannerConfig, PublishedConfig, RsbandConfig, TebConfig
 from monstertruck_planners.local.core import LocalPlannerCore, remaining_band, remaining_path
 from monstertruck_planners.local.elastic_band import cover_footprint
 from monstertruck_planners.local.published import oriented
 from monstertruck_planners.local.teb import WIDTH, NormalEquations, _assemble, resampled, teb_parameters
-from monstertruck_planners.pose_path import PosePath
+from monstertruck_planners.pose_path import PosePath, nearest_pose
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.motion import MotionPath
 from monstertruck_runtime.errors import InputError
