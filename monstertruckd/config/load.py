@@ -652,7 +652,8 @@ def validated(tree: Tree, path: Path, model: type[S]) -> tuple[S, Tree]:
 
 def _mixtures(config: TruckConfig, tree: Tree, path: Path) -> Iterator[str]:
     """Report each simulation key in the configuration of a robot with real ports."""
-    for key, port, remedy in mixed(config):
+    simulated = config.sim is not None
+    for key, port, remedy in mixed(config.devices, config.machine, simulated=simulated, stand=config.stand):
         where, other = (tree.origin(place) or f"{path}:1" for place in (key, port))
         yield f"{where}: {'.'.join(key)}: a simulation cannot use the real port {'.'.join(port)} ({other}): {remedy}"
 

@@ -9,40 +9,51 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from monstertruck_drivers.config import AnyPort, CommandPortConfig, TcpPortConfig
+from monstertruck_drivers.config import AnyPort, CommandPortConfig, Devices, TcpPortConfig
 from monstertruck_drivers.usb.config import UsbPortConfig
-from monstertruckd.config.truck import TruckConfig
 
 PSEUDO: Final = (Path("/dev/pts"), Path("/dev/shm"))  # noqa: S108 - nothing is put there
 """Folders in /dev whose entries are not devices: pseudo terminals, used by emulators, and memory."""
 
 
-def real_ports(config: TruckConfig) -> tuple[str, ...]:
+def real_ports(devices: Devices, machine: Path) -> tuple[str, ...]:
     """Roles of the real devices: by hub on the computer's USB tree, by a node in /dev, or at another address.
 
     Links are followed. A port that does not exist yet is judged by its name.
+
+    Args:
+        devices: devices with their ports.
+        machine: root of the computer's tree.
     """
-    own_tree = _resolved(config.machine) == Path("/")
-    return tuple(role for role, device in config.devices.present().items() if _is_real(device.port, own_tree=own_tree))
+    own_tree = _resolved(machine) == Path("/")
+    return tuple(role for role, device in devices.present().items() if _is_real(device.port, own_tree=own_tree))
 
 
-def mixed(config: TruckConfig) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], str]]:
+def mixed(
+    devices: Devices, machine: Path, *, simulated: bool, stand: str
+) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], str]]:
     """Keys of a simulation in a configuration with a real port.
+
+    Args:
+        devices: devices with their ports.
+        machine: root of the computer's tree.
+        simulated: whether there is a section ``sim``.
+        stand: value of ``stand``.
 
     Yields:
         The key, the key of the first real port, and the remedy.
     """
-    roles = real_ports(config)
+    roles = real_ports(devices, machine)
     if not roles:
         return
     port = ("devices", roles[0], "port")
-    if config.sim is not None:
+    if simulated:
         yield (
             ("sim",),
             port,
             "remove the files with `sim`, or give every device an emulated port, as configs/truck_emulated.yaml does",
         )
-    if config.stand == "simulator":
+    if stand == "simulator":
         yield ("stand",), port, "for a real robot, expected none or overhead"
 
 

@@ -124,7 +124,7 @@ def test_a_program_is_a_camera_only(tmp_path: Path):
     config = truck(tmp_path, at % ("camera", "mjpeg"))
     assert config.devices.camera is not None
     assert config.devices.camera.port.label == "rpicam-vid -o -"
-    assert real_ports(config) == ("camera",)
+    assert real_ports(config.devices, config.machine) == ("camera",)
     for role, kind in (("drive", "epos"), ("camera", "webcam"), ("lidar", "ld19")):
         with pytest.raises(ConfigError, match=f"{role}: only a camera of kind mjpeg may read the output of a program"):
             truck(tmp_path, at % (role, kind))

@@ -19,6 +19,10 @@ def lidar_at(port: dict, **more: object) -> TruckConfig:
     return TruckConfig.model_validate({"version": 2, "devices": {"lidar": lidar}, **more}, strict=False)
 
 
+def roles_of(config: TruckConfig) -> tuple[str, ...]:
+    return real_ports(config.devices, config.machine)
+
+
 @pytest.mark.parametrize(
     ("port", "machine", "real"),
     [
@@ -35,17 +39,17 @@ def lidar_at(port: dict, **more: object) -> TruckConfig:
     ],
 )
 def test_which_ports_are_real(port: dict, machine: str, real: bool):
-    assert real_ports(lidar_at(port, machine=machine)) == (("lidar",) if real else ())
+    assert roles_of(lidar_at(port, machine=machine)) == (("lidar",) if real else ())
 
 
 def test_a_link_is_where_it_leads(tmp_path: Path):
     for target, real in (("/dev/ttyUSB7", True), ("/dev/pts/7", False)):
         link = tmp_path / Path(target).name
         link.symlink_to(target)
-        assert bool(real_ports(lidar_at({"path": str(link)}))) is real
+        assert bool(roles_of(lidar_at({"path": str(link)}))) is real
     root = tmp_path / "machine"
     root.symlink_to("/")
-    assert real_ports(lidar_at({"hub": "1-1", "port": 1}, machine=str(root))) == ("lidar",)
+    assert roles_of(lidar_at({"hub": "1-1", "port": 1}, machine=str(root))) == ("lidar",)
 
 
 @pytest.mark.parametrize(
@@ -77,8 +81,8 @@ def test_a_simulation_with_real_ports_is_refused_by_file_and_line(text: str, lin
 
 
 def test_no_shipped_configuration_is_a_mixture():
-    assert real_ports(load_truck(CONFIGS / "truck.yaml")[0])
-    assert not real_ports(load_truck(CONFIGS / "truck_emulated.yaml")[0])
+    assert roles_of(load_truck(CONFIGS / "truck.yaml")[0])
+    assert not roles_of(load_truck(CONFIGS / "truck_emulated.yaml")[0])
 
 
 @pytest.mark.parametrize("part", PARTS, ids=lambda part: part.stem)
