@@ -11,7 +11,7 @@ from monstertruck_drivers.computer import Computer, Machine
 from monstertruck_drivers.config import AnyPort, CommandPortConfig, Device, TcpPortConfig, kind_of
 from monstertruck_drivers.i2c.port import I2cPort
 from monstertruck_drivers.link import BAUD, Port
-from monstertruck_drivers.scanning.mounting import MountedScans
+from monstertruck_drivers.scanning.mounting import MountedScans, hangs
 from monstertruck_drivers.tcp import TcpPort
 from monstertruck_drivers.tty import SerialPort
 from monstertruck_drivers.usb.config import UsbPortConfig
@@ -211,8 +211,9 @@ def _publisher(
         return None
     if topic not in topics.SCANS:
         return bus.publisher(topic, Writer.DRIVER)
-    lidar = config.devices.lidars()[role.name]
-    return MountedScans(scan_publisher(role.name, config, bus), lidar.mount, getattr(lidar.driver, "hidden", ()))
+    lidar, out = config.devices.lidars()[role.name], scan_publisher(role.name, config, bus)
+    hidden = getattr(lidar.driver, "hidden", ())
+    return MountedScans(out, lidar.mount, hidden) if hidden or hangs(lidar.mount) else out
 
 
 def scan_publisher(role: str, config: TruckConfig, bus: Bus) -> Publisher[LaserScan]:
