@@ -46,7 +46,7 @@ from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 ROOT: Final = Path(__file__).resolve().parents[1]
 SOURCES: Final = ("monstertruckd", "drivers", "planners", "schemas")
 EMULATED: Final = ("monstertruck_sim/", "runtime/clock.py", "emulator.py", "firmware.py", "cable.py")
-GOALS: Final = {"scan_to_motor": 25, "scan_through_slam": 40, "goal_to_tracker": 20, "configuration_value": 6}
+GOALS: Final = {"scan_to_motor": 22, "scan_through_slam": 32, "goal_to_tracker": 16, "configuration_value": 5}
 PYDANTIC: Final = BaseModel.__init__.__code__.co_filename
 SCAN_BYTES: Final = 500
 """More bytes than any answer of the lidar that is no scan."""
