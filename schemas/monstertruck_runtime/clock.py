@@ -3,7 +3,7 @@
 Every coroutine sleeps on its event loop as usual (``asyncio.sleep``, ``asyncio.timeout``); only the loop differs.
 ``VirtualLoop`` jumps to the next timer as soon as no task is ready, so an hour of driving takes only its computing
 time, and two runs with one seed are identical. A replay clock is a virtual loop that starts at the log's first stamp
-and can be limited to a multiple of real time. ``Schedule`` gives periodic work without drift on any loop.
+and can be limited to a multiple of real time. ``Schedule`` runs periodic work without drift on any loop.
 
 This is the only module that may import ``time``.
 """
@@ -46,7 +46,7 @@ ENDING: Final = 600.0
 
 
 def is_date(real: int) -> bool:
-    """Whether a real time (ns) can be the date of a run."""
+    """Whether a real time (ns) is a plausible date of a run."""
     # 946_684_800 * SECOND: 2000-01-01: earlier dates come from a virtual clock, or a computer whose clock was never set
     return real >= 946_684_800 * SECOND
 
@@ -267,7 +267,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     def _call_soon_stalled(
         self, callback: Callable[[*Ts], object], *args: *Ts, context: contextvars.Context | None = None
     ) -> asyncio.Handle:
-        """Run as asyncio does, but hold back callbacks of the robot's computer during a stall."""
+        """Schedule as asyncio does, but hold back callbacks of the robot's computer during a stall."""
         context = contextvars.copy_context() if context is None else context
         if self._held is None or not context.get(ON_COMPUTER, False):
             return super().call_soon(callback, *args, context=context)
@@ -337,19 +337,19 @@ class _VirtualSelector(selectors.DefaultSelector):
         self._files = 0
 
     def register(self, fileobj: Any, events: int, data: Any = None) -> selectors.SelectorKey:
-        """Count one more watched file."""
+        """Watch a file, and count it."""
         key = super().register(fileobj, events, data)
         self._files += 1
         return key
 
     def unregister(self, fileobj: Any) -> selectors.SelectorKey:
-        """Count one watched file less."""
+        """Stop watching a file."""
         key = super().unregister(fileobj)
         self._files -= 1
         return key
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        """Events of files; without watched files, the time of an idle loop jumps."""
+        """Return events of files; without watched files, the time of an idle loop jumps."""
         loop = self._loop
         loop.watch()
         idle, wait = timeout is None, loop.next_timer()
@@ -462,7 +462,7 @@ def run_wall(main: Callable[[WallClock], Coroutine[Any, Any, T]]) -> T:
 
 
 def _ignore_second_interrupt() -> None:
-    """Within an ``asyncio.Runner``, whose handler cancels at the first interrupt and aborts at later ones."""
+    """Ignore the second interrupt within ``asyncio.Runner``, whose handler would abort; the first one cancels."""
     handler, come = signal.getsignal(signal.SIGINT), itertools.count(1)
 
     def interrupt(number: int, frame: FrameType | None) -> None:

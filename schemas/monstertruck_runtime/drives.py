@@ -60,7 +60,7 @@ SILENT: Final = DriveReport()
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """Result of a drive."""
+    """Outcome of a drive."""
 
     reason: Reason
     text: str
@@ -78,7 +78,7 @@ class Arrival:
 
 @dataclass(frozen=True, slots=True)
 class TaskEnd(Generic[S]):
-    """Result of a task."""
+    """Outcome of a task."""
 
     reason: Reason
     text: str
@@ -397,7 +397,7 @@ async def _disarmed(clock: Clock, stand: StandstillMonitor, timeout: float = 0.0
 
 
 async def _first(*ends: Coroutine[Any, Any, Arrival]) -> Arrival:
-    """Return the first of two ends."""
+    """Return the result that is available first of two."""
     tasks = [asyncio.create_task(end) for end in ends]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -471,7 +471,7 @@ async def _watched(
 
 @asynccontextmanager
 async def reported(stand: StandstillMonitor, clock: Clock | None, report: DriveReport | None) -> AsyncIterator[None]:
-    """Report why the truck stands while the body of the context runs."""
+    """Report why the truck stands for as long as the context is open."""
     watching = None
     if clock is not None and report is not None:
         watching = asyncio.create_task(_say_why_it_stands(stand, clock, report))

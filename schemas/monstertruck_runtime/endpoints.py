@@ -34,7 +34,7 @@ def is_endpoint(text: str) -> bool:
 
 
 def endpoint_of(protocol: str, host: str, port: int) -> str:
-    """Endpoint of a host name or address; IPv6 addresses are put in brackets."""
+    """Return the endpoint of a host name or address; IPv6 addresses are put in brackets."""
     return f"{protocol}/[{host}]:{port}" if ":" in host else f"{protocol}/{host}:{port}"
 
 
@@ -74,9 +74,9 @@ def local_endpoint(listen: Iterable[str], environment: Mapping[str, str] = os.en
 
 
 def nearest(endpoint: str, environment: Mapping[str, str] = os.environ) -> str:
-    """Unix socket of the daemon behind a TCP endpoint of this machine, if it answers.
+    """Return the Unix socket of the daemon behind a TCP endpoint of this machine, if it answers.
 
-    It has its own connections, so it answers even if stations use all TCP connections.
+    The socket has its own connections, so the daemon answers even if stations use all TCP connections.
     """
     port = port_of(endpoint)
     if protocol_of(endpoint) != "tcp" or host_of(endpoint) not in LOCAL_HOSTS or port is None:
@@ -156,7 +156,7 @@ def announce(robot: str, listen: Iterable[str]) -> socket.socket | None:
 
 
 def announced(table: Path = Path("/proc/net/unix")) -> list[Announced]:
-    """Announced daemons of all users."""
+    """Return the announced daemons of all users."""
     try:
         names = [line.rpartition(" @")[2] for line in table.read_text(errors="replace").splitlines()]
     except OSError:
@@ -173,7 +173,7 @@ def announced(table: Path = Path("/proc/net/unix")) -> list[Announced]:
 
 
 def public(endpoint: str) -> str:
-    """Endpoint in the form used by users: the port of a Unix socket as an address of this machine."""
+    """Return the endpoint as shown to users: a Unix socket as the port on this machine that it belongs to."""
     if not endpoint.startswith(UNIX):
         return endpoint
     port = Path(endpoint.removeprefix(UNIX)).stem
@@ -181,7 +181,7 @@ def public(endpoint: str) -> str:
 
 
 def robot_on_host(robot: str, endpoint: str) -> str:
-    """Robot and computer for messages, such as ``truck on rover``."""
+    """Return robot and computer for messages, such as ``truck on rover``."""
     host = host_of(endpoint) if protocol_of(endpoint) in _ADDRESSED else LOCAL_HOSTS[0]
     return f"{robot} on {socket.gethostname() if host in LOCAL_HOSTS else host}"
 
@@ -221,5 +221,5 @@ def _answers(path: Path) -> bool:
 
 
 def _address(endpoint: str) -> str:
-    """Without protocol, metadata and configuration."""
+    """Return the endpoint without protocol, metadata and configuration."""
     return endpoint.partition("/")[2].partition("?")[0].partition("#")[0]

@@ -41,7 +41,7 @@ class InputError(TruckError):
 
 
 class DamagedFileError(InputError):
-    """A file that a service depends on cannot be read; a retry is useless."""
+    """A service's file is damaged; a retry is useless."""
 
 
 class NotFoundError(TruckError):
@@ -69,7 +69,7 @@ class NotPermittedError(TruckError):
 
 
 class CommandFailedError(TruckError):
-    """A program of the computer failed; the text is its output."""
+    """An external program failed; the text is its output."""
 
     reason = Reason.COMMAND_FAILED
 
@@ -172,7 +172,7 @@ def disk_reason(error: OSError) -> Reason:
 
 
 def first_of(error: BaseException, kind: type[E]) -> E | None:
-    """First exception of a kind in an exception group, which may be the exception itself; None without one."""
+    """Return the first exception of a kind in an exception, possibly a group; None without one."""
     if isinstance(error, BaseExceptionGroup):
         found = (first_of(each, kind) for each in error.exceptions)
         return next((each for each in found if each is not None), None)

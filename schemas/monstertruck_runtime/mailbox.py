@@ -1,4 +1,4 @@
-"""Read ends of topics: a mailbox per subscription, with the delivery chosen by its reader."""
+"""Mailboxes: read ends of topics, whose delivery is chosen by the reader."""
 
 import asyncio
 from collections import deque

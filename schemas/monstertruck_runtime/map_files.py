@@ -148,9 +148,7 @@ def files_of(place: Path) -> list[Path]:
 def turned(
     cells: NDArray[np.int8], resolution: float, origin: tuple[float, float, float]
 ) -> tuple[NDArray[np.int8], tuple[float, float]]:
-    """Resample a grid whose lower left corner has the pose ``origin`` (x, y, yaw.
-
-    M, rad) to cells along the map's axes.
+    """Resample a grid whose lower left corner has the pose ``origin`` (x, y in m, yaw in rad) to axis-aligned cells.
 
     Every cell takes the value of the cell that contains its centre. Every occupied cell occupies the cell that contains
     its own centre, so that no wall is lost.
@@ -213,7 +211,7 @@ def _picture_of(path: Path) -> str | None:
 
 
 def map_content(world: WorldMap, image: str) -> tuple[str, bytes]:
-    """YAML text of a map whose image is named ``image``, and the image (PNG)."""
+    """Return the YAML text of a map whose image is named ``image``, and the image (PNG)."""
     shades = np.full(world.cells.shape, 205, dtype=np.uint8)
     shades[(world.cells >= 0) & (world.cells <= FREE_TO)] = 254
     shades[world.cells >= OCCUPIED_FROM] = 0
@@ -232,7 +230,7 @@ def map_content(world: WorldMap, image: str) -> tuple[str, bytes]:
 
 
 def _read_keys(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The keys of map_server, validated, and the other keys."""
+    """Return the validated keys of map_server, and the other keys."""
     no_map = f"{path}: not a map: expected the folder of a saved map, or a map_server YAML"
     try:
         keys = read_yaml(path)

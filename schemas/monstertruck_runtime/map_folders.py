@@ -212,7 +212,7 @@ def _newest(folder: Path) -> MapSave:
 
 
 def _run(folder: Path, run: str | None) -> str:
-    """``run``, or the run of the existing map."""
+    """Return ``run``, or the run of the existing map."""
     if run is not None:
         return run
     try:
@@ -222,7 +222,7 @@ def _run(folder: Path, run: str | None) -> str:
 
 
 def _base(saves: Path, run: str) -> tuple[Path | None, Mapping[str, _SavedFile]]:
-    """Latest intact save of a run, and its content."""
+    """Return the latest intact save of a run, and its content."""
     for path in numbered_saves(saves):
         try:
             manifest = _check(path)
@@ -273,7 +273,7 @@ def _write(path: Path, data: bytes) -> None:
 
 
 def _take_over(old: Path, new: Path) -> None:
-    """Link a file of another save into this one; it is copied if the file system has no hard links."""
+    """Link a file of another save into this one; copy it if the file system has no hard links."""
     try:
         new.hardlink_to(old)
     except OSError as error:

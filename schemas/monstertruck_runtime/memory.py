@@ -15,7 +15,7 @@ def settle() -> None:
 
     A full collection of them takes tens of milliseconds, repeatedly. Fewer pages also save a few hundredths of the
     processor time of a loop that sleeps between short callbacks and so runs with cold caches. Takes up to a third of a
-    second: call it at the end of start-up, before anything moves.
+    second: call it at the end of start-up, before the robot can move.
     """
     gc.collect()
     gc.freeze()
@@ -28,7 +28,7 @@ def settle() -> None:
 
 
 def give_back() -> None:
-    """Return free pages to the system, also between used ones; otherwise the heap keeps them.
+    """Return free memory pages, including those between used ones, to the system; otherwise the heap keeps them.
 
     Takes about a millisecond for 200 MB; no effect without glibc's ``malloc_trim``.
     """

@@ -17,7 +17,7 @@ LONGEST_FRAME: Final = 65_535
 class MovingPicture:
     """Writes a GIF atomically; a context manager.
 
-    Keeps only the latest frame and the differences between frames.
+    Keeps only the latest frame and the differences between frames in memory.
 
     Args:
         file: file to write, replaced at the end; without a frame no file is written.
@@ -71,7 +71,7 @@ class MovingPicture:
         self._newest, self._waiting = picture, (part, place, self._shown)
 
     def close(self) -> None:
-        """Write the last frame and the end of the file.
+        """Write the last frame and the trailer of the file.
 
         Raises:
             OSError: it cannot be written.

@@ -1,4 +1,4 @@
-"""Reading of external files: maps, images, arrays, tables, logs, certificates, files of earlier runs.
+"""Readers of external files: maps, images, arrays, tables, logs, certificates, files of earlier runs.
 
 A reader opens its file with one of the functions here, or works inside ``reading``. Every failure in any library is
 then converted to one of our errors, which names the file, the expected content and the finding. Sizes are bounded
@@ -54,7 +54,7 @@ def reading(file: Path | str, expected: str, refusal: type[TruckError] = InputEr
 
 
 def quoted(text: str) -> str:
-    """Return a text from outside as one line, short enough for a refusal."""
+    """Return an external text as one line, short enough for an error message."""
     return " ".join(text.split())[:200]
 
 
@@ -169,11 +169,11 @@ def _require_array(stream: Any, size: int) -> None:
 
 @contextmanager
 def picture(file: Path, expected: str = "a picture") -> Iterator["Image.Image"]:
-    """Open a picture of one of ``FORMATS``, whose pixels are decoded when they are wanted.
+    """Open an image in one of ``FORMATS``; its pixels are decoded on access.
 
     Raises:
-        InputError: it cannot be read, is of no known format, or has too many pixels; in the body: whatever decoding
-            raises.
+        InputError: it cannot be read, is of an unknown format, or has too many pixels; in the body: any decoding
+            error.
     """
     from PIL import Image  # noqa: PLC0415 - only for pictures
 
@@ -191,7 +191,7 @@ def picture(file: Path, expected: str = "a picture") -> Iterator["Image.Image"]:
 
 
 def require_pixels(name: object, width: float, height: float) -> None:
-    """Require a picture of at most ``MOST_PIXELS``.
+    """Reject an image of more than ``MOST_PIXELS``.
 
     Raises:
         InputError: it has more.

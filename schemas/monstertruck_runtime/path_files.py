@@ -144,7 +144,7 @@ def _lines(head: str, columns: Sequence[Array], delimiter: str) -> str:
 
 
 def _waypoint(x: float, y: float, yaw: float) -> dict[str, list[float]]:
-    """A pose in the format of Nav2's RViz panel: position, and quaternion w, x, y, z."""
+    """Return a pose in the format of Nav2's RViz panel: position, and quaternion w, x, y, z."""
     return {"pose": [x, y, 0.0], "orientation": [math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]}
 
 
@@ -156,7 +156,7 @@ def _is_yaml(file: FilePath) -> bool:
 
 
 def _table(text: str, file: FilePath, columns: Sequence[str], *, closed: bool) -> tuple[Array, Array, Array]:
-    """Poses, directions and speeds (or none) of a table."""
+    """Return poses, directions and speeds (or none) of a table."""
     rows = rows_of(text, file, EXPECTED)
     if not rows:
         raise InputError(f"{file}: expected {EXPECTED}: the file is empty")
@@ -179,7 +179,7 @@ def _table(text: str, file: FilePath, columns: Sequence[str], *, closed: bool) -
 
 
 def _require(right: NDArray[np.bool_], what: str, file: FilePath, rows: list[tuple[int, list[str]]]) -> None:
-    """Report the first invalid row."""
+    """Raise an error for the first invalid row."""
     if not right.all():
         line, cells = rows[int(np.argmin(right))]
         raise InputError(f"{file}:{line}: expected {what}, found {quoted(','.join(cells))}")
@@ -197,9 +197,9 @@ def _column(file: FilePath, rows: list[tuple[int, list[str]]], found: Mapping[st
 
 
 def _names(text: str, rows: list[tuple[int, list[str]]], columns: Sequence[str]) -> tuple[list[str], int]:
-    """Column names, and the number of rows they occupy.
+    """Return the column names, and the number of rows they occupy.
 
-    From the caller, the first row, or the last comment before it.
+    The names come from the caller, the first row, or the last comment before it.
     """
     first, cells = rows[0]
     if columns:
@@ -235,7 +235,7 @@ def _numbers(file: FilePath, line: int, cells: list[str], names: Sequence[str]) 
 
 
 def _headings(points: Array, *, closed: bool) -> Array:
-    """Direction of the path at each point, shape (n,), rad."""
+    """Return the direction of the path at each point, shape (n,), rad."""
     if closed:
         points = np.concatenate((points[-1:], points, points[:1]))
     way = np.gradient(points, axis=0)
@@ -273,7 +273,7 @@ def _mapping(value: Any) -> Mapping[str, Any]:
 
 
 def _pose(row: Any, where: str) -> tuple[float, float, float]:
-    """A waypoint in any of the supported forms."""
+    """Parse a waypoint in any of the supported forms."""
     row = _mapping(row)
     if "latitude" in row:
         raise InputError(f"{where}: has a latitude: expected metres in the map")
@@ -310,7 +310,7 @@ def _finite(where: str, *values: Any) -> tuple[float, float, float]:
 
 
 def _through(poses: Array, *, closed: bool) -> Array:
-    """A curve through waypoints with their headings, shape (m, 3): cubic in each gap, a pose every ``SPACING`` m.
+    """Return a curve through waypoints and their headings, shape (m, 3): cubic in each gap, a pose every ``SPACING`` m.
 
     Raises:
         InputError: it is too long.

@@ -68,7 +68,7 @@ class Plugin:
         """Return an instance of the implementation.
 
         Raises:
-            InputError: it does not load, or has other arguments.
+            InputError: it does not load, or takes other arguments.
         """
         return self.called(self.implementation, *arguments, **named)
 
@@ -90,10 +90,10 @@ class Plugin:
         return cast("Callable[..., Any]", found)
 
     def called(self, place: str, *arguments: Any, **named: Any) -> Any:
-        """Call the class or function at ``module:name``.
+        """Call the class or function at ``module:name`` and return its result.
 
         Raises:
-            InputError: see ``callable_at``; or it has other arguments.
+            InputError: see ``callable_at``; or it takes other arguments.
         """
         make = self.callable_at(place)
         try:
@@ -155,7 +155,7 @@ class Catalog(ExtensibleTable[P], Generic[P]):
         self._base, self._row_class = base, type(rows[0])
 
     def fault(self, row: Any) -> str | None:
-        """Error for an invalid plug-in entry of another distribution."""
+        """Return an error in a plug-in entry of another distribution, or None."""
         if not isinstance(row, self._row_class):
             return f"expected a {self._row_class.__name__}, found {type(row).__name__}"
         model: Any = row.settings_class()
@@ -221,11 +221,11 @@ class KindSection:
 
     @property
     def models(self) -> tuple[type[Schema], ...]:
-        """Models the section may hold."""
+        """Return the models that the section may hold."""
         return tuple(self.catalog.settings.values())
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """The union, discriminated by ``kind``."""
+        """Return the schema of the union, discriminated by ``kind``."""
         choices = {name: handler.generate_schema(model) for name, model in self.catalog.settings.items()}
         return core_schema.tagged_union_schema(choices, "kind" if self.default is None else self._kind)
 
@@ -236,7 +236,7 @@ class KindSection:
 
 
 def wrong_default(model: type[BaseModel], place: str) -> str | None:
-    """Return the first field of a model whose default its annotation does not allow; None if all fit."""
+    """Return the first field of a model whose default violates its annotation; None if all are valid."""
     for name, field in model.model_fields.items():
         if field.is_required():
             continue
@@ -250,7 +250,7 @@ def wrong_default(model: type[BaseModel], place: str) -> str | None:
 
 
 def kind_of(model: type[BaseModel]) -> str | None:
-    """The single kind of a settings model; None for other models."""
+    """Return the single kind of a settings model; None for other models."""
     field = model.model_fields.get("kind")
     if field is None or get_origin(field.annotation) is not Literal:
         return None
@@ -259,7 +259,7 @@ def kind_of(model: type[BaseModel]) -> str | None:
 
 
 def classes_in(annotation: Any) -> Iterator[type[Any]]:
-    """All classes in an annotation, including the settings models of catalogs."""
+    """Yield all classes in an annotation, including the settings models of catalogs."""
     if isinstance(annotation, KindSection):
         yield from annotation.models
     elif isinstance(annotation, type):
@@ -269,7 +269,7 @@ def classes_in(annotation: Any) -> Iterator[type[Any]]:
 
 
 def models_in(field: FieldInfo) -> Iterator[type[BaseModel]]:
-    """All models that a field of a model may contain."""
+    """Yield all models that a field of a model may contain."""
     for annotation in (field.annotation, *field.metadata):
         for cls in classes_in(annotation):
             if issubclass(cls, BaseModel):

@@ -24,7 +24,7 @@ class Publisher(Protocol[M_contra]):
         """Sequence number for the next message of this topic."""
 
     def put(self, message: M_contra) -> None:
-        """Deliver the message to every subscriber; never blocks."""
+        """Deliver the message to all subscribers; never blocks."""
 
 
 class Subscription(Protocol[M_co]):
@@ -58,17 +58,17 @@ class BusPort(Protocol):
     """The bus, for plug-ins that choose their topics themselves."""
 
     def publisher(self, topic: Topic[M], writer: Writer) -> Publisher[M]:
-        """The only write end of ``topic``.
+        """Return the only write end of ``topic``.
 
         Raises:
             RuntimeError: ``writer`` is not the topic's writer, or the write end is already in use.
         """
 
     def subscribe(self, topic: Topic[M], delivery: Delivery) -> Mailbox[M]:
-        """A read end of ``topic``; for a retained topic it contains the latest message at once."""
+        """Return a read end of ``topic``; for a retained topic it contains the latest message at once."""
 
     def event_sink(self) -> EventSink:
-        """Sink of events."""
+        """Return a sink of events."""
 
 
 Ready = Callable[[], None]

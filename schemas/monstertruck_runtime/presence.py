@@ -1,4 +1,4 @@
-"""Waiting for a later message of a robot that may restart or fall silent, or whose service may fail."""
+"""Waits for a later message of a robot that may restart or fall silent, or whose service may fail."""
 
 import asyncio
 from collections.abc import Awaitable
@@ -26,7 +26,7 @@ class Subscriber(Protocol):
 
 
 async def while_it_runs(robot: Subscriber, work: Awaitable[T], needs: ServiceName) -> T:
-    """Result of ``work``, which waits for a message of the service ``needs`` of the robot's current run.
+    """Return the result of ``work``, which waits for a message of the service ``needs`` of the robot's current run.
 
     Raises:
         RequestRefusedError: the service failed, or the robot restarted, so the new run does not know the request.

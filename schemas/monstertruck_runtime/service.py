@@ -151,7 +151,7 @@ async def supervise(
 
 
 async def _serve(service: Service, ready: Ready) -> None:
-    """Run one session; a loss while its scope ends does not replace the cancellation."""
+    """Run one session; an error while its scope ends does not replace the cancellation."""
     try:
         await service.run(ready)
     except TruckError as error:
@@ -162,13 +162,13 @@ async def _serve(service: Service, ready: Ready) -> None:
 
 
 def _asked_to_end() -> bool:
-    """Whether this task itself was cancelled, not one that it waited for."""
+    """Whether this task itself was cancelled, rather than a task that it awaits."""
     task = asyncio.current_task()
     return task is not None and task.cancelling() > 0
 
 
 class _Session:
-    """Health bookkeeping of the service's present run."""
+    """Health record of the service's current run."""
 
     def __init__(self, name: str, clock: Clock, report: HealthSink) -> None:
         self._name = name
@@ -192,7 +192,7 @@ class _Session:
             log.info("%s: ready", self._name)
 
     def log_loss(self, reason: Reason, detail: str) -> None:
-        """Log the first loss of an outage, and every new cause, as a warning; repetitions with a lower level."""
+        """Log the first loss of an outage, and every new cause, as a warning; log repetitions at a lower level."""
         log.log(logging.DEBUG if reason in self._warned else logging.WARNING, "%s: %s", self._name, detail)
         self._warned.add(reason)
 

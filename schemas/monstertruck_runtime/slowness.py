@@ -55,7 +55,7 @@ class SlowComputer:
         return _Measured(work, name, self)
 
     def note(self, name: str, used: float) -> None:
-        """Record processor time (s) for which no other task has to wait."""
+        """Record processor time (s) that delays no other task."""
         self.turns.setdefault(name, []).append(used)
 
     def charge(self, name: str, used: float) -> None:
@@ -90,16 +90,16 @@ class _Measured(Coroutine[Any, Any, T]):
         return self._turn(self._work.send, value)
 
     def throw(self, *error: Any) -> Any:
-        """Run one turn that starts with an exception."""
+        """Run one turn that begins with an exception."""
         _module.set(self._name)
         return self._turn(self._work.throw, *error)
 
     def close(self) -> None:
-        """End it at its current wait."""
+        """End the coroutine at its current await."""
         self._work.close()
 
     def __await__(self) -> Generator[Any, Any, T]:
-        """Only tasks drive it, by ``send`` and ``throw``."""
+        """Raise: only tasks run this coroutine, by ``send`` and ``throw``."""
         raise NotImplementedError
 
     def _turn(self, go_on: Callable[..., Any], *arguments: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Why a robot does not drive: the current reason from the gate's state, its cause from events and stops."""
+"""Explains why a robot does not drive: the gate's current reason, and its cause from events and stops."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -41,7 +41,7 @@ class StandstillMonitor:
         self._said: list[str] = []
 
     def why(self) -> str:
-        """Why the gate does not let the robot drive, with the cause of a disarm if known; empty if it does.
+        """Return why the robot may not drive, with the cause of a disarm if known; empty if it may.
 
         Call it regularly, also while the robot drives.
         """
@@ -57,7 +57,7 @@ class StandstillMonitor:
         return ", ".join(texts) or held.why
 
     def _cause(self, held: GateState) -> str:
-        """Source or cause of the disarm or emergency stop; empty if unknown."""
+        """Return the source or cause of the disarm or emergency stop; empty if unknown."""
         stop, estopped = self._stops.latest, held.mode is GateMode.ESTOPPED
         said = [] if estopped else self._said
         if stop is not None and (stop.mode is GateMode.ESTOPPED if estopped else self._after_it_began(stop)):
@@ -65,7 +65,7 @@ class StandstillMonitor:
         return "; ".join(dict.fromkeys(said))
 
     def _after_it_began(self, stop: Stop) -> bool:
-        """Whether it ended the latest drive: in front of an obstacle the robot stands, but its driver keeps control."""
+        """Whether the stop ended the latest drive; in front of an obstacle the robot stands, but its driver keeps control."""
         return self._since is not None and stop.stamp >= self._since and not stop.mode.accepts_motion
 
     def _take(self) -> None:
@@ -79,7 +79,7 @@ class StandstillMonitor:
 
 
 def _causes(stop: Stop) -> str:
-    """Tripped check and its causes, without measurements."""
+    """Return the tripped check and its causes, without measurements."""
     return "; ".join(", because ".join(cause.text for cause in chain(stop.causes, head)) for head in heads(stop.causes))
 
 

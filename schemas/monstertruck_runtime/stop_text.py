@@ -7,7 +7,7 @@ from monstertruck_schemas.event import Cause, Measurement, Stop
 
 
 def causes_text(causes: Sequence[Cause], now: int) -> str:
-    """All causes in one line, each followed by its own causes.
+    """Describe all causes in one line, each followed by its own causes.
 
     Args:
         causes: as in ``Stop``.
@@ -38,7 +38,7 @@ def stop_lines(stop: Stop, now: int) -> list[str]:
 
 
 def heads(causes: Sequence[Cause]) -> list[Cause]:
-    """Causes that directly tripped the gate: causes of no other cause."""
+    """Return the causes that directly tripped the gate: those that caused no other cause."""
     deeper = {cause.because for cause in causes}
     return [cause for index, cause in enumerate(causes) if index not in deeper]
 
@@ -56,7 +56,7 @@ def chain(causes: Sequence[Cause], head: Cause) -> Iterator[Cause]:
 
 
 def cause_text(cause: Cause, now: int) -> str:
-    """Describe one cause: ``no fresh lidar scan (for 10 ms, age 260 ms, limit 250 ms)``."""
+    """Describe one cause, for example ``no fresh lidar scan (for 10 ms, age 260 ms, limit 250 ms)``."""
     lasted = (now - cause.since) / SECOND
     notes = [f"for {duration_text(lasted)}"] if lasted >= 1e-3 else []
     notes += [measurement_text(measurement) for measurement in cause.measurements]

@@ -1,4 +1,4 @@
-"""Transitions between the event loop and threads: blocking work off the loop, and calls back onto it."""
+"""Blocking work in threads, and calls from threads back to the event loop."""
 
 import asyncio
 import threading
@@ -148,7 +148,7 @@ async def in_daemon_thread(function: Callable[[], T]) -> T:
 
 
 async def inline(function: Callable[[], T]) -> T:
-    """Run ``function`` on the loop: for the virtual clock, whose time would advance while a thread works."""
+    """Run ``function`` on the loop: for the virtual clock, which would advance while a thread works."""
     return function()
 
 

@@ -235,11 +235,11 @@ class _LoopThread:
             raise
 
     def do(self, work: Callable[[TruckClient], Coroutine[Any, Any, T]]) -> T:
-        """Run a coroutine on that loop and wait for its result; an interrupt cancels it."""
+        """Run a coroutine on the thread's loop and wait for its result; an interrupt cancels it."""
         return self._submit(work(self._client))
 
     def later(self, function: Callable[[], object]) -> None:
-        """Call ``function`` on that loop without waiting; no effect after the loop has ended."""
+        """Call ``function`` on the thread's loop without waiting; no effect after the loop has ended."""
         with suppress(RuntimeError):
             self._loop.call_soon_threadsafe(function)
 
@@ -279,7 +279,7 @@ class _LoopThread:
         asyncio.run_coroutine_threadsafe(others(), self._loop).result()
 
     async def _give_up(self) -> None:
-        """End the pending calls of other threads."""
+        """Cancel the pending calls of other threads."""
         tasks = asyncio.all_tasks() - {asyncio.current_task()}
         for task in tasks:
             task.cancel()

@@ -35,7 +35,7 @@ class _BoundedComposer(Composer):
         """Number of nodes in each complete node, by its id."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """Count a node and everything below it."""
+        """Compose a node and everything below it, and count both."""
         alias, place = self.parser.check_event(AliasEvent), self.parser.peek_event().start_mark
         before = self._count
         self._count += 1
@@ -76,7 +76,7 @@ def read_yaml(path: Path) -> Any:
 
 
 def yaml_problem(error: MarkedYAMLError) -> str:
-    """Return what is wrong with a text that is not valid YAML, or is nested too deeply."""
+    """Return the error in a text that is not valid YAML, or is nested too deeply."""
     if isinstance(error, MaxDepthExceededError):
         return f"nested more than {bounded_yaml().max_depth} times"
     return f"not valid YAML: {error.problem}"

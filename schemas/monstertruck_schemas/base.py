@@ -98,7 +98,7 @@ def field_docs(model: type[BaseModel]) -> dict[str, str]:
 
 @cache
 def _docs_in(module: str) -> dict[str, dict[str, str | None]]:
-    """Docstrings after annotated names, by qualified name of the class."""
+    """Return the docstrings after annotated names, by qualified name of the class."""
     try:
         tree = ast.parse(inspect.getsource(sys.modules[module]))
     except (KeyError, OSError, TypeError):
@@ -144,7 +144,7 @@ class LiveSetting:
 
 
 def live_settings(config: Schema, prefix: str = "") -> Iterator[LiveSetting]:
-    """All live settings of a configuration, in order."""
+    """Yield all live settings of a configuration, in order."""
     for name, field in type(config).model_fields.items():
         value = getattr(config, name)
         if isinstance(value, Schema):

@@ -1,6 +1,6 @@
 """Tables that other installed distributions extend by entry points.
 
-A broken entry point is reported and skipped: it never keeps the robot from starting.
+A broken entry point is reported and skipped: it never prevents the start of the robot.
 """
 
 import importlib.metadata
@@ -55,7 +55,7 @@ class ExtensibleTable(Mapping[str, R]):
 
     Args:
         group: group of the entry points, for instance ``monstertruck.trackers``.
-        ours: rows of this repository.
+        ours: built-in rows.
     """
 
     def __init__(self, group: str, ours: Iterable[R]) -> None:

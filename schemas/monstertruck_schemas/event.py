@@ -20,7 +20,7 @@ class Severity(StrEnum):
 
 
 class Event(Message):
-    """A decision, refusal, fault or recovery, with its stable reason."""
+    """A decision, refusal, fault or recovery, with its reason code."""
 
     reason: Reason
     """Reason code."""
@@ -35,7 +35,7 @@ class Event(Message):
 
 
 class Call(Message):
-    """An answered remote call: caller, call and answer."""
+    """A remote call and its answer: caller, name and result."""
 
     name: str
     """Name of the call, e.g. ``goal``."""
@@ -85,7 +85,7 @@ class Cause(Schema):
 
 
 class Stop(Message):
-    """Cause of a stop by the gate: the tripped checks with start and measurements, and the causes behind them.
+    """Cause of a stop by the gate: the tripped checks with start and measurements, and their own causes.
 
     ``stamp`` is the time of the stop. If a cause becomes known later (a hub is reported lost only once all its devices
     are gone), a second message with the same ``number`` adds it.

@@ -43,7 +43,7 @@ class HealthTable(Message):
 
 
 class CalibrationState(Schema):
-    """Calibration by one wizard: value, quality and expiry."""
+    """Result of one calibration wizard: value, quality and expiry."""
 
     wizard: str
     """Wizard that measured it."""
@@ -216,7 +216,7 @@ class LinkMedium(StrEnum):
 
 
 class LinkLevel(StrEnum):
-    """Judgement of a network link, with hysteresis; a connected cable is excellent."""
+    """Rating of a network link, with hysteresis; a connected cable is excellent."""
 
     EXCELLENT = "excellent"
     GOOD = "good"

@@ -297,7 +297,7 @@ class ExplorationState(Message):
 
 
 class MissionLine(Schema):
-    """A step in the list of a mission's steps."""
+    """One line of a mission's list of steps."""
 
     number: str
     """Position, such as 2.1"""

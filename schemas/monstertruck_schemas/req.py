@@ -181,7 +181,7 @@ class ControlRequest(Request):
 
 
 class Verb(StrEnum):
-    """Order to a task server; the orders of every kind of task map to these."""
+    """Order to a task server; the orders of all kinds of task are mapped to these."""
 
     START = "start"
     RESUME = "resume"
@@ -215,7 +215,7 @@ class GoalRequest(Request):
 
     @property
     def verb(self) -> Verb:
-        """Request to a task server."""
+        """Order to the task server."""
         return Verb.START
 
     @property
@@ -242,19 +242,19 @@ class GoalControl(Request):
 
     @property
     def verb(self) -> Verb:
-        """Request to the task server."""
+        """Order to the task server."""
         return Verb.STOP if self.order is GoalOrder.CANCEL else Verb(self.order)
 
 
 class BehaviourOrder(StrEnum):
-    """What can be asked about behaviours."""
+    """Orders about behaviours."""
 
     START = "start"
     STOP = "stop"
 
 
 class BehaviourRequest(Request):
-    """Start a configured behaviour, or stop the one that runs."""
+    """Start a configured behaviour, or stop the running one."""
 
     order: BehaviourOrder
     behaviour: Annotated[str, Field(max_length=64)] = ""
@@ -266,19 +266,19 @@ class BehaviourRequest(Request):
 
     @property
     def verb(self) -> Verb:
-        """Request to the task server."""
+        """Order to the task server."""
         return Verb(self.order)
 
 
 class ExploreOrder(StrEnum):
-    """What can be asked about exploration."""
+    """Orders about explorations."""
 
     START = "start"
     STOP = "stop"
 
 
 class ExploreRequest(Request):
-    """Order to start or to end an exploration."""
+    """Start or stop an exploration."""
 
     order: ExploreOrder
     home: bool | None = None
@@ -292,12 +292,12 @@ class ExploreRequest(Request):
 
     @property
     def verb(self) -> Verb:
-        """Request to the task server."""
+        """Order to the task server."""
         return Verb(self.order)
 
 
 class MissionOrder(StrEnum):
-    """What can be asked about missions."""
+    """Orders about missions."""
 
     START = "start"
     RESUME = "resume"
@@ -305,7 +305,7 @@ class MissionOrder(StrEnum):
 
 
 class MissionRequest(Request):
-    """Start a mission, resume one that was interrupted, or end the one that runs."""
+    """Start a mission, resume an interrupted one, or stop the running one."""
 
     order: MissionOrder
     mission: Mission | None = None
@@ -317,24 +317,24 @@ class MissionRequest(Request):
 
     @property
     def verb(self) -> Verb:
-        """Request to the task server; resuming a mission is a start, from its current step."""
+        """Order to the task server; resuming a mission is a start, from its current step."""
         return Verb.STOP if self.order is MissionOrder.STOP else Verb.START
 
 
 class PathRequest(Request):
-    """A path computed off board, to be tracked."""
+    """A path computed by a client, to be tracked."""
 
     path: Path
 
 
 class LocalisationRequest(Request):
-    """Pose of odom in map, found by a localisation off board; it stands for the lease."""
+    """Pose of odom in map, estimated by a client; valid for the lease."""
 
     correction: Pose2D
 
 
 class MapRequest(Request):
-    """Occupancy grid in map, made off board."""
+    """Occupancy grid in map, made by a client."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(ser_json_bytes="base64", val_json_bytes="base64")
 
@@ -351,7 +351,7 @@ class MapRequest(Request):
 
 
 class PathStart(Request):
-    """Drive the path of the configuration once, until its end or until the robot is disarmed."""
+    """Drive the configured path once, until its end or until the robot is disarmed."""
 
     path: Annotated[str, Field(min_length=1, max_length=128)]
     """Name of the file without its extension."""

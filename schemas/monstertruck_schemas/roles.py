@@ -37,7 +37,7 @@ SHAFTS: Final = (DeviceRole.DRIVE, DeviceRole.DRIVE_2, DeviceRole.DRIVE_3, Devic
 
 
 class ServiceName(StrEnum):
-    """Services without a device. Each takes its name from here; no role of another package may have one of these."""
+    """Names of services without a device. A device role of another package must not use one of them."""
 
     BEHAVIOURS = "behaviours"
     BLACKBOX = "blackbox"

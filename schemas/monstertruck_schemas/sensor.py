@@ -9,10 +9,10 @@ from monstertruck_schemas.base import Float64Array, Message, Nanoseconds, Pose2D
 
 
 class LaserScan(Message):
-    """One lidar revolution, beam i at ``start_angle + i * angle_increment``, in the order of measurement.
+    """One lidar revolution: beam i at ``start_angle + i * angle_increment``, in the order of measurement.
 
-    A scanner that turns clockwise has ``end_angle`` below ``start_angle``. ``stamp`` is the time of the FIRST beam in
-    ``ranges``; beam i is ``i * time_increment`` later. The number of beams may vary from scan to scan.
+    A scanner that turns clockwise has ``end_angle`` below ``start_angle``. ``stamp`` is the time of the first beam in
+    ``ranges``; beam i is measured ``i * time_increment`` later. The number of beams may vary from scan to scan.
     """
 
     start_angle: float
@@ -41,7 +41,7 @@ class LaserScan(Message):
 
     @property
     def angle_increment(self) -> float:
-        """Angle from a beam to the next, rad, negative clockwise."""
+        """Angle between consecutive beams (rad), negative if clockwise."""
         return (self.end_angle - self.start_angle) / max(len(self.ranges) - 1, 1)
 
     @property
@@ -102,7 +102,7 @@ class DriveMode(StrEnum):
 
 
 class DriveFeedback(Message):
-    """Drive motor as its controller reports it, at the MOTOR shaft, sign as in the robot (forward positive)."""
+    """State of the drive motor reported by its controller, at the motor shaft; forward is positive."""
 
     position: float
     """Motor shaft angle since start, rad, unwrapped."""
@@ -119,7 +119,7 @@ class DriveFeedback(Message):
 
 
 class SteeringFeedback(Message):
-    """Pulses the servo controller sends now, as servo angles; NOT a measured horn position."""
+    """Pulses currently sent by the servo controller, as servo angles; not measured positions."""
 
     front: float
     """Front servo angle, rad, left positive, 0 = straight ahead."""
@@ -205,7 +205,7 @@ class SonarRanges(Message):
     """Whether it depends on an expired calibration."""
 
     def echo(self, name: str) -> SonarEcho | None:
-        """The sonar of that name; None: the array has none."""
+        """Return the sonar of that name; None if the array has none."""
         return next((sonar for sonar in self.sonars if sonar.name == name), None)
 
 
@@ -221,7 +221,7 @@ class Imu(Message):
 
 
 class WheelEncoders(Message):
-    """Two wheels that nothing drives, as their own encoders count them: the rear wheels of a tricycle."""
+    """Encoders of two free wheels, such as the rear wheels of a tricycle."""
 
     left: float
     """Angle of the left wheel since the driver's first reading, rad, unwrapped, forward positive."""
@@ -261,7 +261,7 @@ class HandControls(Message):
 
 
 class CompressedImage(Message):
-    """One picture of the camera; ``stamp`` is when it was exposed, as far as the camera states it."""
+    """One camera image; ``stamp`` is its time of exposure, as far as the camera reports it."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(ser_json_bytes="base64", val_json_bytes="base64")
 
@@ -283,7 +283,7 @@ class TorqueState(StrEnum):
 
 
 class StabiliserJoint(Schema):
-    """One servo of the lidar's mount; signs follow the joint angle. Absent unit: measurements are None."""
+    """One servo of the lidar's mount; signs follow the joint angle. Measurements of an absent servo are None."""
 
     torque: TorqueState
     """State of the unit's torque."""
@@ -302,10 +302,10 @@ class StabiliserJoint(Schema):
 
 
 class StabiliserFeedback(Message):
-    """Joints of the lidar's mount as its servos report them.
+    """Joints of the lidar's mount, reported by its servos.
 
-    The pitch joint sits on the body, the roll joint on the pitch joint, the lidar on the roll joint: the lidar's
-    axes are Ry(pitch) Rx(roll) in ``frame``, that is roll, pitch, yaw = (roll, pitch, 0) of REP 103.
+    The pitch joint is mounted on the body, the roll joint on the pitch joint, and the lidar on the roll joint: the
+    lidar's axes are Ry(pitch) Rx(roll) in ``frame``, that is roll, pitch, yaw = (roll, pitch, 0) of REP 103.
     """
 
     pitch: float | None = None
@@ -319,8 +319,8 @@ class StabiliserFeedback(Message):
 class StandPose(Message):
     """Pose of a robot measured by an external test stand; ``frame`` is the stand's, with its origin in the middle.
 
-    For studies and for judging estimates: no estimator and no planner reads it. The consistency check compares it with
-    the robot's own measures of its motion.
+    For studies and for evaluating estimates: estimators and planners do not read it. The consistency check compares it
+    with the robot's own measures of its motion.
     """
 
     pose: Pose2D

@@ -67,7 +67,7 @@ class Peers(Message):
 
 
 class ScanMotion(Message):
-    """Motion of base between two scans, by the scans alone; ``stamp`` is the later stamp."""
+    """Motion of base between two scans, measured by the scans alone; ``stamp`` is the later stamp."""
 
     since: Nanoseconds
     """Stamp of the earlier scan."""
@@ -94,7 +94,7 @@ class Transform(Schema):
 
 
 class Transforms(Message):
-    """The whole frame tree, static mounts included."""
+    """The whole frame tree, including static mounts."""
 
     transforms: tuple[Transform, ...]
 
@@ -162,7 +162,7 @@ class DoubtKind(StrEnum):
 
     @property
     def lasting(self) -> bool:
-        """Whether it lasts until the robot is armed again: a robot that stands shows nothing about motion."""
+        """Whether it lasts until the robot is armed again: a robot at rest provides no evidence about motion."""
         return self in {DoubtKind.MOTION, DoubtKind.DELAY}
 
 
@@ -186,9 +186,9 @@ class Doubt(Schema):
 
 
 class UnshownMotion(Schema):
-    """Motion of the body, by the scans, while its wheels show standstill; the points of the scans prove it.
+    """Motion of the body measured by the scans while its wheels report standstill; the scan points prove it.
 
-    One follows the other: none counts a motion twice.
+    Successive measurements do not overlap: no motion is counted twice.
     """
 
     since: Nanoseconds
@@ -202,7 +202,7 @@ class UnshownMotion(Schema):
 
 
 class StandingBody(Schema):
-    """Evidence by the scans that the body stands although its wheels roll; a turn of 1 rad counts as 1 m."""
+    """Evidence from the scans that the body stands although its wheels roll; a turn of 1 rad counts as 1 m."""
 
     since: Nanoseconds
     """Stamp of the latest scan before it stood."""
@@ -241,17 +241,17 @@ class GateMode(StrEnum):
 
     @property
     def active(self) -> bool:
-        """Whether the truck is armed, drives or is being stopped: it may move."""
+        """Whether the truck may move: it is armed, drives or is stopping."""
         return self in (GateMode.ARMED, GateMode.DRIVING, GateMode.STOPPING)
 
     @property
     def accepts_motion(self) -> bool:
-        """Whether a request of motion is carried out."""
+        """Whether the gate carries out motion requests."""
         return self in (GateMode.ARMED, GateMode.DRIVING)
 
     @property
     def moving(self) -> bool:
-        """Whether the truck drives or is being stopped."""
+        """Whether the truck drives or is stopping."""
         return self in (GateMode.DRIVING, GateMode.STOPPING)
 
 

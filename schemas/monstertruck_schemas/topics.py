@@ -84,7 +84,7 @@ SOURCE_NAME: Final = re.compile(r"[A-Za-z0-9_.:-][A-Za-z0-9_.@:-]{0,63}")
 
 
 class Writer(StrEnum):
-    """Who may publish a topic; the bus refuses everybody else."""
+    """Permitted publisher of a topic; the bus refuses all others."""
 
     DRIVER = "driver"
     ESTIMATION = "estimation"
@@ -98,7 +98,7 @@ class Writer(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Topic(Generic[M]):
-    """One row: content of ``mt/<robot>/<name>``, rate, writers, and where it is kept."""
+    """One row: message model of ``mt/<robot>/<name>``, rate, writer and retention."""
 
     name: str
     model: type[M]
@@ -140,7 +140,7 @@ class Topic(Generic[M]):
 
     @property
     def inward(self) -> bool:
-        """Whether it comes to the robot from outside."""
+        """Whether the robot receives it from clients."""
         return self.writer in (Writer.OUTSIDE, Writer.STAND)
 
     def fresh_for(self) -> float:
@@ -393,10 +393,10 @@ OPEN_GROUPS: Final = {
 
 
 class TopicTable(ExtensibleTable[Topic[Message]]):
-    """Topics by name: ours, then topics of other distributions."""
+    """Topics by name: built-in ones, then those of other distributions."""
 
     def fault(self, row: Any) -> str | None:
-        """Fault of a topic of another distribution."""
+        """Return an error in a topic of another distribution, or None."""
         if not isinstance(row, Topic):
             return f"expected a Topic, found {type(row).__name__}"
         if row.group not in OPEN_GROUPS or not re.fullmatch(r"[a-z]+/[a-z][a-z0-9_]*", row.name):
@@ -431,12 +431,12 @@ TOPICS: Final = BY_NAME.values()
 
 
 def topics_of(group: str) -> Iterator[Topic[Message]]:
-    """All rows of one group."""
+    """Yield all rows of one group."""
     return (topic for topic in TOPICS if topic.group == group)
 
 
 def rpc_key(robot: str, name: str, source: str | None = None) -> str:
-    """Key of a remote call by ``source``; None for a call without a caller."""
+    """Return the key of a remote call by ``source``; None for a call without a caller."""
     key = f"{KEY_ROOT}/{robot}/rpc/{name}"
     return key if source is None else f"{key}/{source}"
 
@@ -451,11 +451,11 @@ def estop_key(robot: str, source: str = "*") -> str:
 
 
 def sender_in(robot: str, key: str) -> tuple[str, str | None] | None:
-    """Request and source of a ``key``: the inverse of ``Topic.key`` and ``rpc_key``.
+    """Return request and source of a ``key``: the inverse of ``Topic.key`` and ``rpc_key``.
 
     Returns:
-        Name of a request's topic or of a call, and the source, None where the key has none. None for other keys: those
-        with wildcards, and names that no key may hold.
+        Name of the topic or call, and the source, None if the key has none. None for keys with wildcards and for
+        invalid names.
     """
     head, parts = key.split("/")[:2], key.split("/")[2:]
     if head != [KEY_ROOT, robot] or not all(map(SOURCE_NAME.fullmatch, parts)):
@@ -473,7 +473,7 @@ def sender_in(robot: str, key: str) -> tuple[str, str | None] | None:
 
 
 def owner_of(source: str) -> str:
-    """Name on the certificate of a source: programs of one owner call themselves ``owner:anything``."""
+    """Name on the certificate of a source; one owner's programs are named ``owner:suffix``."""
     return source.partition(":")[0]
 
 

@@ -1,4 +1,4 @@
-"""The USB tree as the ``health`` group publishes it: hubs, ports, devices, and why one may not start yet."""
+"""Messages of the USB tree: hubs, ports, devices, and why a device has not started."""
 
 from enum import StrEnum
 from typing import Annotated
@@ -21,7 +21,7 @@ class UsbState(StrEnum):
 
 
 class UsbNode(Schema):
-    """One hub or device, named by where it is plugged in."""
+    """One hub or device, named by its port."""
 
     name: str
     """Kernel's name of the place: ``usb1`` is a root hub, ``1-1.2`` is port 2 of the hub at root port 1."""
@@ -52,6 +52,6 @@ class UsbNode(Schema):
 
 
 class UsbTree(Message):
-    """Everything on the USB buses, and the configured devices that are not there; parents before children."""
+    """All hubs and devices on the USB buses, and the missing configured devices; parents before children."""
 
     nodes: tuple[UsbNode, ...]

@@ -22,7 +22,7 @@ OFF_FOR: Final = 600.0
 
 
 class ZoneArea(Schema):
-    """A polygon in map with its rule; the even-odd rule decides what lies inside."""
+    """A polygon in map with its rule; points are inside by the even-odd rule."""
 
     kind: Literal["keepout", "speed"]
     """Rule: no entry, or a speed limit."""
@@ -67,7 +67,7 @@ class ZoneMask(Schema):
 
 
 class Zone(Schema):
-    """One zone as it is in force: a polygon or a mask."""
+    """An active zone: a polygon or a mask."""
 
     name: Name
     """Name of the zone."""
@@ -87,7 +87,7 @@ class Zone(Schema):
 
 
 class Zones(Message):
-    """All zones, and those that the robot is in."""
+    """All zones, and those that contain the robot."""
 
     zones: tuple[Zone, ...] = ()
     inside: tuple[str, ...] = ()

@@ -243,7 +243,7 @@ class WorkerProcess:
             self._server.kill()
 
     def _reported(self, timeout: float) -> int | None:
-        """Read the next number on ``_end``.
+        """Return the next number on ``_end``.
 
         None if none was received for ``timeout`` seconds, or the server has ended.
         """
@@ -256,7 +256,7 @@ class WorkerProcess:
         return server.NUMBER.unpack(data)[0] if data else None
 
     def _gone(self) -> str:
-        """Error that tells how the process ended."""
+        """Return an error text that states how the process ended."""
         with self._reading:
             self._pid = self._pid or self._reported(0.0)
             text = f"worker {self._name} (process {self._pid or 'never forked'}) is gone"

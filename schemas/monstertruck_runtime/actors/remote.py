@@ -132,7 +132,7 @@ class StepCodec:
 
 
 def _name(cls: type[Any]) -> str:
-    """Plug-ins of two distributions may use the same class name."""
+    """Return the wire name of a class, with its module: two plug-ins may use the same class name."""
     return f"{cls.__module__}.{cls.__qualname__}"
 
 
@@ -141,7 +141,7 @@ def _travels(cls: type[Any]) -> bool:
 
 
 def _annotations(cls: type[Any]) -> list[Any]:
-    """Codec of the fields of a dataclass or model."""
+    """Return the annotations of the fields of a dataclass or model."""
     if issubclass(cls, Schema):
         return [part for field in cls.model_fields.values() for part in (field.annotation, *field.metadata)]
     hints = get_type_hints(cls, include_extras=True)
@@ -243,7 +243,7 @@ class RemoteActor:
         self._notify()
 
     def _take(self, payload: dict[str, Any]) -> bool:
-        """Whether these outputs are complete."""
+        """Accept a part of the outputs; return whether they are complete."""
         self._parts.append(str(payload["part"]))
         most = 1_000_000  # maximum total number of characters of outputs
         if sum(map(len, self._parts)) > most:
@@ -295,7 +295,7 @@ class RemoteWorkQueue:
         return self._actors[name]
 
     async def serve(self, payload: dict[str, Any]) -> dict[str, Any]:
-        """Serve one call of a server.
+        """Serve one call of a plan server.
 
         Raises:
             NotFoundError: no such steps are placed on another machine.

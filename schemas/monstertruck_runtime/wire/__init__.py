@@ -55,7 +55,7 @@ def encode(topic: Topic[M], message: M) -> bytes:
 
 
 def _escaped(value: Any) -> Any:
-    r"""Escape characters outside UTF-8 in ``value``: undecodable bytes of a file's name become ``\xff``."""
+    r"""Return ``value`` with characters outside UTF-8 escaped: undecodable bytes of a file's name become ``\xff``."""
     match value:
         case str():
             bytes_shown = _BYTE.sub(lambda byte: f"\\x{ord(byte[0]) - 0xDC00:02x}", value)
@@ -103,9 +103,9 @@ def schema(topic: Topic[Any]) -> WireSchema:
 
 
 def _flat(root: dict[str, Any]) -> dict[str, Any]:
-    """JSON Schema without references and unions, which log viewers do not support.
+    """Return the JSON Schema without references and unions, which log viewers do not support.
 
-    An optional value may be missing: ``encode`` writes no nulls.
+    An optional value may be missing: ``encode`` omits nulls.
     """
     definitions = root.pop("$defs", {})
 

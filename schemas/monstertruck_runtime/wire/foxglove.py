@@ -1,4 +1,4 @@
-"""Our messages as the well-known ``foxglove.*`` protobuf messages, so that stock viewers draw them.
+"""Conversion of our messages to ``foxglove.*`` protobuf messages, which standard viewers display.
 
 The fields of ``foxglove_fields.proto`` extend Foxglove's published descriptors, in a separate descriptor pool, because
 the default pool contains the published ones under the same names. Bytes of version 0.1.0, which also writes zero
@@ -127,7 +127,7 @@ def _packed(*numbers: float) -> bytes:
 
 
 def _unpacked(numbers: _Numbers, count: int) -> tuple[float, ...]:
-    """Check and return this many numbers."""
+    """Return the numbers after checking their count."""
     data = _bytes(numbers)
     try:
         return _DOUBLES[count].unpack(data)
@@ -137,7 +137,7 @@ def _unpacked(numbers: _Numbers, count: int) -> tuple[float, ...]:
 
 
 def _pose2d(exact: _Numbers, pose: Any) -> Pose2D:
-    """Our exact (x, y, yaw) if the writer included it, otherwise the standard pose."""
+    """Return our exact (x, y, yaw) if the writer included it, otherwise the standard pose."""
     x, y, yaw = _unpacked(exact, 3) if exact else _planar(pose)
     return Pose2D(x=x, y=y, yaw=yaw)
 
