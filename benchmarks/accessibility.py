@@ -1,10 +1,10 @@
-"""The station's page before axe-core: every view, light and dark, at every width.
+"""Check the station's page with axe-core: every view, light and dark, at every width.
 
     python -m benchmarks.accessibility [--quick]
 
-Two robots that only publish, a station and Debian's chromium, each a process. Counted are findings that axe-core calls
-serious or critical, by the rules of WCAG 2 A and AA. Then the page is reloaded, and its messages are held up: it has to
-show the same robot again, and to lower its speed limit. The last line is JSON.
+Two robots that only publish, a station and Debian's chromium run as processes. The benchmark counts the findings that
+axe-core rates serious or critical by the rules of WCAG 2 A and AA. Then the page is reloaded and its messages are
+delayed: it must show the same robot again, and lower its speed limit. The last line is JSON.
 """
 
 import argparse
@@ -40,7 +40,7 @@ GOALS = {"serious_findings": 0, "same_robot_after_reload": True, "slows_when_lat
 
 
 async def findings(page: Page, view: str) -> list[str]:
-    """Serious ones on what is shown now."""
+    """Return the serious findings on the current view."""
     found: dict[str, Any] = await page.evaluate(RUN)
     return [
         f"{view}: {row['id']} ({row['impact']}): {row['nodes'][0]['html'][:200]}"
@@ -50,7 +50,7 @@ async def findings(page: Page, view: str) -> list[str]:
 
 
 async def views(browser: Browser, url: str, size: str, scheme: str) -> tuple[int, list[str]]:
-    """All views of one size and theme: how many, and what was found."""
+    """Check all views of one size and theme; return their number and the findings."""
     width, height = SIZES[size]
     page = await opened(browser, url, viewport={"width": width, "height": height}, color_scheme=scheme)
     await page.evaluate(AXE)
@@ -71,7 +71,7 @@ async def views(browser: Browser, url: str, size: str, scheme: str) -> tuple[int
 
 
 async def poor_link(browser: Browser, url: str) -> dict[str, bool]:
-    """A page of the second robot, reloaded, then with messages held up."""
+    """Check the page of the second robot after a reload, then with delayed messages."""
     page = await opened(browser, url)
     await page.click("#fleet-open")
     await page.click("#fleet-rows button >> text=bob")
@@ -87,7 +87,7 @@ async def poor_link(browser: Browser, url: str) -> dict[str, bool]:
 
 
 async def main(quick: bool) -> int:
-    """Look at everything."""
+    """Run all checks."""
     port = free_endpoint().rpartition(":")[2]
     url = f"http://127.0.0.1:{port}/"
     robots = {name: free_endpoint() for name in ("ann", "bob")}

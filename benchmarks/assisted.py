@@ -1,8 +1,8 @@
-"""Assisted driving against bare driving: random sticks in three worlds, without and with ``gate.assist.on``.
+"""Compare assisted with bare driving: random sticks in three worlds, with and without ``gate.assist.on``.
 
     python benchmarks/assisted.py [--drives 5] [--seconds 40] [--first 0]
 
-The whole daemon drives on the virtual clock. A stick of full speed changes its steering at random every 1 to 4 s, and
+The whole daemon drives on the virtual clock. A stick at full speed changes its steering at random every 1 to 4 s, and
 one time in six it reverses for a second. The same seed moves the same stick in both runs.
 
 ``metres`` is the distance travelled, ``stops`` counts stops before an obstacle or unseen ground, ``contacts`` drives
@@ -36,7 +36,7 @@ STOPS = frozenset({Reason.OBSTACLE_STOP, Reason.UNSEEN_STOP})
 
 
 def stick(seed: int, seconds: float) -> list[tuple[float, float]]:
-    """Speed (m/s) and front angle (rad) of each request."""
+    """Return speed (m/s) and front angle (rad) of each request."""
     rng = np.random.default_rng([4, seed])
     asked: list[tuple[float, float]] = []
     while len(asked) < seconds / PERIOD:
@@ -47,7 +47,7 @@ def stick(seed: int, seconds: float) -> list[tuple[float, float]]:
 
 
 def drive(world: str, seed: int, seconds: float, *, assisted: bool) -> dict[str, float]:
-    """One drive."""
+    """Simulate one drive."""
     config = load_config(CONFIG, SimulatedTruckConfig)[0].model_copy(update={"path": None, "recorder": None})
     changes: dict[str, Any] = {"sim": {"seed": seed, "world": {"map": world}}}
     config = with_overlay(config, changes | {"blackbox": None, "gate": {"assist": {"on": assisted}}})
@@ -77,7 +77,7 @@ def drive(world: str, seed: int, seconds: float, *, assisted: bool) -> dict[str,
 
 
 def main() -> None:
-    """Drive all sticks and print the sums."""
+    """Run all drives and print the sums."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--drives", type=int, default=5, help="in each world")
     parser.add_argument("--seconds", type=float, default=40.0)

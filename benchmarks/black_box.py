@@ -1,10 +1,9 @@
-"""What the black box costs: memory of a full minute, processor time per message, and the loop's wait while it writes.
+"""Cost of the black box: memory of a full minute, processor time per message, and delay of the loop while it writes.
 
-The traffic is that of the whole emulated truck (virtual clock, camera 640x480 at 15 Hz), played over and over until
-the ring is full. Memory is the ring's pages, and what grows on the heap as well. Writing is measured by the
-processor time between two of the writer's pauses, which bounds what the loop waits for the interpreter whatever else
-the machine does, and next to an event loop that wakes every millisecond, in rounds with and without it. The last line
-is JSON.
+The traffic is that of the whole emulated truck (virtual clock, camera 640x480 at 15 Hz), replayed until the ring is
+full. Memory includes the ring's pages and the growth of the heap. The delay by writing is measured in two ways: by the
+processor time between two pauses of the writer, which bounds the loop's wait for the interpreter independently of the
+load, and beside an event loop that wakes every millisecond, in rounds with and without writing. The last line is JSON.
 
     python benchmarks/black_box.py [ROUNDS]
 """
@@ -38,7 +37,7 @@ Traffic = list[tuple[int, str, bytes]]
 
 
 def traffic() -> Traffic:
-    """(ns since the begin, topic, payload) of some seconds of the whole truck."""
+    """Record some seconds of the whole truck: (ns since the start, topic, payload)."""
     config = with_overlay(load_config(FULL, SimulatedTruckConfig)[0], {"recorder": None, "map": None})
     kept: Traffic = []
 
@@ -55,7 +54,7 @@ def traffic() -> Traffic:
 
 
 class Played:
-    """Clock whose time is that of the message being played."""
+    """Clock whose time is the instant of the message being replayed."""
 
     now_ns = 0
 
@@ -69,7 +68,7 @@ class Played:
 
 
 class Pauses(threading.Event):
-    """The writer's pauses, and the processor time between them."""
+    """Pauses of the writer, and the processor time between them."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -77,7 +76,7 @@ class Pauses(threading.Event):
         self._since: float | None = None
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Pause."""
+        """Note a pause."""
         if self._since is not None:
             self.bursts.append(thread_time() - self._since)
         done = super().wait(timeout)
@@ -89,7 +88,7 @@ TURNS = round(BlackBoxConfig().before / SAMPLE) + 3
 
 
 def fill(box: BlackBox, clock: Played, messages: Traffic, first: int) -> tuple[int, float]:
-    """Play until everything that is kept is there; messages, and thread CPU seconds they took."""
+    """Replay messages until the ring is full; return their number and the thread's processor time (s)."""
     count, spent = 0, 0.0
     for turn in range(first, first + TURNS):
         batch = [(at, BY_NAME[name], bytes(bytearray(data))) for at, name, data in messages]
@@ -103,7 +102,7 @@ def fill(box: BlackBox, clock: Played, messages: Traffic, first: int) -> tuple[i
 
 
 async def waits(during: "asyncio.Future[Any] | None", seconds: float) -> float:
-    """99th percentile of a millisecond timer's lateness, ms."""
+    """Return the 99th percentile of the lateness of a millisecond timer, ms."""
     late = []
     end = perf_counter() + seconds
     while not during.done() if during is not None else perf_counter() < end:

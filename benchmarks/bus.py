@@ -1,23 +1,23 @@
-"""What typed messages cost over plain ones: a scan of 682 beams to another process and back.
+"""Cost of typed messages compared with plain bytes: a scan of 682 beams to another process and back.
 
     python benchmarks/bus.py [--rounds N]
 
-Pairs of processes run side by side and take turns, so that what else the machine does weighs on all of them, and every
-round restarts them, for where the system puts a process weighs as much as its work. They are:
+Pairs of processes run side by side and take turns, so that other load affects all of them equally. Every round restarts
+them, because the placement of a process by the system matters as much as its work. The pairs are:
 
 - ``typed``: the product, message object in, message object awaited in asyncio;
-- ``raw``: the same bytes untyped over the same way, Zenoh and asyncio; ``direct``: taken in the thread that reads the
-  network, as the product does;
-- ``quick_typed``, ``quick_raw``: these, with Zenoh's threads arranged for little delay as ``docs/zenoh.md`` has it;
-- ``rospy``: ``sensor_msgs/LaserScan``, with its option for little delay (``tcp_nodelay``), where Debian's ROS 1 is
-  installed (``apt install python3-rospy python3-sensor-msgs python3-rosmaster``).
+- ``raw``: the same bytes, untyped, over Zenoh and asyncio; ``direct``: received in the thread that reads the network,
+  as in the product;
+- ``quick_typed``, ``quick_raw``: the same with Zenoh's threads configured for low latency, see ``docs/zenoh.md``;
+- ``rospy``: ``sensor_msgs/LaserScan`` with ``tcp_nodelay``, where Debian's ROS 1 is installed (``apt install
+  python3-rospy python3-sensor-msgs python3-rosmaster``).
 
 The goals are the ratios of ``typed`` to ``raw``, and of ``quick_typed`` to ``rospy``. A round trip is two messages. The
-processor time is that of both processes at 100 round trips a second. The codec is measured alone, in processor time of
-many calls in a row, and for comparison once after a pause each. The last line is JSON.
+processor time is that of both processes at 100 round trips a second. The codec is measured separately: in processor
+time of many consecutive calls, and, for comparison, once after each pause. The last line is JSON.
 
-rospy has the system's Python; all of the product's ends run in it too where it is of our version (``--own-python``: in
-ours), so that programs are compared, not builds of Python.
+rospy uses the system's Python; if it has our version, all ends of the product use it too (``--own-python``: ours), so
+that programs are compared, not builds of Python.
 """
 
 import argparse
@@ -65,7 +65,7 @@ class Pair:
         self._ready = False
 
     def round_trips(self, count: int, rate: float) -> tuple[np.ndarray, float]:
-        """Times in us and processor seconds of both processes per 1000 messages."""
+        """Return the times in us, and the processor seconds of both processes per 1000 messages."""
         if not self._ready:
             assert self._answer() == b"ready\n"
             self._ready = True
@@ -87,7 +87,7 @@ class Pair:
 
 
 def _process_clock(pid: int) -> int:
-    """Number of the clock of another process's processor time, as clock_getcpuclockid(3) makes it."""
+    """Return the id of another process's processor-time clock, computed as by clock_getcpuclockid(3)."""
     return (~pid << 3) | 2
 
 
@@ -106,7 +106,7 @@ def _processes(ping: list[str], echo: list[str], **options: Any) -> Iterator[Pai
 
 @contextmanager
 def zenoh_pair(kind: str) -> Iterator[Pair]:
-    """Ends of ``bus_peers``, each at an address and port that no connection or socket of another has."""
+    """Start the ends of ``bus_peers``, each with an unused address and port."""
     one, other = (f"tcp/127.1.{end}.1:{PORT + end}" for end in (next(_ends), next(_ends)))
     program = [sys.executable, str(HERE / "bus_peers.py"), kind.removeprefix("quick_")]
     arranged = QUICK if kind.startswith("quick_") else {}
@@ -116,7 +116,7 @@ def zenoh_pair(kind: str) -> Iterator[Pair]:
 
 @contextmanager
 def rospy_pair() -> Iterator[Pair]:
-    """Ends of ``bus_rospy`` with a master of their own."""
+    """Start the ends of ``bus_rospy`` with a separate master."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -140,7 +140,7 @@ def has_rospy() -> bool:
 
 
 def codec(repeats: int = 300, burst: int = 100) -> tuple[float, float]:
-    """Processor us of encoding one scan and of decoding it: median of short bursts, which take turns."""
+    """Return the processor time (us) of encoding and of decoding one scan: medians of short, alternating bursts."""
     message = scan(1234, time.monotonic_ns())
     data = wire.encode(SCAN, message)
     jobs: tuple[Callable[[], object], ...] = lambda: wire.encode(SCAN, message), lambda: wire.decode(SCAN, data)
@@ -156,7 +156,7 @@ def codec(repeats: int = 300, burst: int = 100) -> tuple[float, float]:
 
 
 def from_cold_caches(repeats: int = 200) -> dict[str, float]:
-    """Us of making, encoding and decoding one scan, each a millisecond of sleep after another: medians."""
+    """Return the medians (us) of creating, encoding and decoding one scan after a millisecond of sleep each."""
     message = scan(1234, time.monotonic_ns())
     data = wire.encode(SCAN, message)
     jobs: dict[str, Callable[[], object]] = {
@@ -176,7 +176,7 @@ def from_cold_caches(repeats: int = 200) -> dict[str, float]:
 
 
 def compare(rounds: int) -> dict[str, float]:
-    """Medians over the rounds; ratios are those of one round."""
+    """Return medians over the rounds; each ratio is within one round."""
     kinds = ("typed", "raw", "direct", "quick_typed", "quick_raw", *(("rospy",) if has_rospy() else ()))
     p50, p99, cpu = ({kind: np.empty(rounds) for kind in kinds} for _ in range(3))
     for number in range(rounds):

@@ -1,12 +1,12 @@
-"""The two ends of ``bus.py``: scans to and fro over Zenoh, as the product does it and as plain bytes.
+"""The two ends of ``bus.py``: scans to and fro over Zenoh, as typed messages or plain bytes.
 
     python bus_peers.py typed|raw|direct ping|echo HERE THERE
 
 ``typed``: message object to bus, bridge and Zenoh; Zenoh to client and a message object awaited in asyncio.
-``raw``: plain bytes, put and awaited in asyncio, taken as zenoh-python hands them over. ``direct``: the same, taken in
-the thread that reads the network, as the product does. Every end listens at HERE, as a robot, which sends, and dials
-THERE, as a station, which receives. ``ping`` takes lines ``COUNT RATE`` (rate 0 = one after the other) on its standard
-input and answers with a JSON list of round trips in ns.
+``raw``: plain bytes, put and awaited in asyncio, received through zenoh-python's default handler. ``direct``: the same,
+received in the thread that reads the network, as in the product. Every end listens at HERE, as a robot, which sends,
+and connects to THERE, as a station, which receives. ``ping`` reads lines ``COUNT RATE`` (rate 0: one after the other)
+from its standard input and answers with a JSON list of round trips in ns.
 """
 
 import asyncio
@@ -43,7 +43,7 @@ OTHER = {"ping": "echo", "echo": "ping"}
 
 
 def scan(number: int, stamp: int) -> LaserScan:
-    """One scan as a driver makes it."""
+    """Return a scan like a driver's."""
     return LaserScan(
         stamp=stamp,
         received=stamp,
@@ -63,7 +63,7 @@ def scan(number: int, stamp: int) -> LaserScan:
 
 @asynccontextmanager
 async def typed(me: str, here: str, there: str) -> AsyncIterator[tuple[Callable[[LaserScan], None], Callable]]:
-    """Put function and receive function of the product's own classes."""
+    """Put and receive functions of the product's own classes."""
     clock = WallClock()
     bus = Bus(clock)
     out = bus.publisher(SCAN, Writer.DRIVER)
@@ -80,7 +80,7 @@ async def typed(me: str, here: str, there: str) -> AsyncIterator[tuple[Callable[
 
 
 class Inbox:
-    """Plain bytes from Zenoh's thread to one waiting coroutine: the least that does it."""
+    """Minimal queue of plain bytes from Zenoh's thread to one waiting coroutine."""
 
     def __init__(self) -> None:
         self._items: deque[bytes] = deque(maxlen=16)
@@ -93,7 +93,7 @@ class Inbox:
         self._loop.call_soon_threadsafe(self._wake)
 
     async def get(self) -> bytes:
-        """Wait for the next one."""
+        """Wait for the next message."""
         while not self._items:
             self._waiter = self._loop.create_future()
             await self._waiter
@@ -110,7 +110,7 @@ async def raw(
 ) -> AsyncIterator[Callable[[bytes], None]]:
     """Put function of plain bytes; ``receive`` is called with every sample of the other end.
 
-    Sessions are configured as the product's are, for the comparison is of what lies between them and the reader.
+    Sessions are configured like the product's: the comparison is of the code between session and reader.
     """
     server, client = ZenohConfig(listen=(here,)), ZenohConfig(connect=(there,))
     listening = zenoh.open(zenoh.Config.from_json5(session_config(me, server, listeners(server)[0])))
@@ -149,7 +149,7 @@ async def pings(put: Callable[[int], None], receive: Callable[[], Awaitable[obje
 
 
 async def run(_clock: WallClock, kind: str, me: str, here: str, there: str) -> None:
-    """Play one end until standard input ends (ping) or for ever (echo)."""
+    """Run one end until standard input ends (ping) or for ever (echo)."""
     payload = wire.encode(SCAN, scan(0, time.monotonic_ns()))
     async with AsyncExitStack() as stack:
         asyncio.get_running_loop().call_later(1.5, settle)  # as the daemon does

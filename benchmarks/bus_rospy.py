@@ -2,8 +2,8 @@
 
     python3 bus_rospy.py ping|echo
 
-``ping`` takes lines ``COUNT RATE`` (rate 0 = one after the other) on its standard input and answers with a JSON list of
-round trips in ns.
+``ping`` reads lines ``COUNT RATE`` (rate 0: one after the other) from its standard input and answers with a JSON list
+of round trips in ns.
 """
 
 import json
@@ -20,7 +20,7 @@ TIMEOUT = 5.0
 
 
 def main() -> None:
-    """Play one end until standard input ends."""
+    """Run one end until standard input ends."""
     me = sys.argv[1]
     other = {"ping": "echo", "echo": "ping"}[me]
     rospy.init_node(me, disable_signals=True)

@@ -65,7 +65,7 @@ EMPTIER = (0.15,)
 
 @dataclass(frozen=True)
 class Truck:
-    """One truck, calibrated."""
+    """One calibrated truck."""
 
     seed: int
     verdicts: list[Verdict]
@@ -77,7 +77,7 @@ class Truck:
 
 
 def calibrate(seed: int, engine: str) -> Truck:
-    """The whole procedure on one truck, in the world of an engine."""
+    """Run the whole procedure on one truck, in the world of an engine."""
     logging.disable(logging.CRITICAL)
     began = process_time()
     rng = np.random.default_rng([seed, 4])
@@ -113,7 +113,7 @@ def calibrate(seed: int, engine: str) -> Truck:
 
 
 def figures(trucks: Iterable[Truck]) -> dict[str, dict[str, float]]:
-    """By estimate: trucks, share of them whose truth lies inside, median half-width, error over half-width (rms)."""
+    """Return by estimate: trucks, share with the truth inside, median half-width, error over half-width (RMS)."""
     rows: dict[str, list[Verdict]] = defaultdict(list)
     for truck in trucks:
         for verdict in truck.verdicts:
@@ -132,7 +132,7 @@ def figures(trucks: Iterable[Truck]) -> dict[str, dict[str, float]]:
 
 
 def light(fits: int, wizards: Iterable[str]) -> tuple[dict[str, Any], bool]:
-    """Fits on drawn measurements: coverage by wizard, half-widths by estimate, and whether both are as meant."""
+    """Fit drawn measurements: coverage by wizard, half-widths by estimate, and whether both meet the goals."""
     inside, halves, fine = {}, {}, True
     for wizard in wizards:
         found = coverage(wizard, fits)
@@ -146,7 +146,7 @@ def light(fits: int, wizards: Iterable[str]) -> tuple[dict[str, Any], bool]:
 
 
 def swapped(count: int) -> tuple[dict[str, Any], dict[str, Any], bool]:
-    """Wrong parts that every wizard names, of so many; goals; whether they are met."""
+    """Return the share of wrong parts that every wizard names, the goals, and whether they are met."""
     found = {wizard: noticed(wizard, count) for wizard in WRONG}
     for wizard, named in found.items():
         print(f"{wizard}: {named} of {count} named", flush=True)
@@ -163,7 +163,7 @@ PARTS: dict[str, Callable[[int], tuple[dict[str, Any], dict[str, Any], bool]]] =
 
 
 def main() -> int:
-    """Calibrate; 0 = every estimate holds in 90 % of the trucks, and every truck's curvature to 2 %, and light fits."""
+    """Calibrate; 0: estimates are right in 90 % of the trucks, curvatures within 2 %, and the fits meet the goals."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--jobs", type=int, default=1)

@@ -1,9 +1,9 @@
-"""What the camera costs the control tick, on the wall clock: the whole truck over ptys, with and without its camera.
+"""Effect of the camera on the control tick, on the wall clock: the whole truck over ptys, with and without its camera.
 
-Daemon and simulator run as processes, as on a robot; runs with and without 640x480 at 15 Hz alternate, so that what
-else the machine does weighs on both. A tick is as late as the stamp of its command is behind the 50 Hz grid; the figure
-is the difference of the medians of the runs' 99th percentiles. That is worth something on a quiet machine only, so the
-processor time one picture takes on the daemon's loop is measured, too. The last line is JSON.
+Daemon and simulator run as processes, as on a robot. Runs with and without 640x480 at 15 Hz alternate, so that other
+load affects both. The lateness of a tick is the delay of its command's stamp relative to the 50 Hz grid; the figure is
+the difference of the medians of the runs' 99th percentiles. It is only meaningful on a quiet machine; therefore the
+processor time of one picture on the daemon's loop is measured, too. The last line is JSON.
 
     python benchmarks/camera.py [ROUNDS] [SECONDS]
 """
@@ -42,7 +42,7 @@ WARM_UP = 6.0
 
 
 async def lateness(clock: Clock, folder: Path, *, camera: bool, seconds: float) -> tuple[Array, int]:
-    """Every tick's lateness, ms, and the number of pictures that came."""
+    """Return the lateness of every tick (ms), and the number of received pictures."""
     endpoint = free_endpoint()
     config = write_overlay(FULL, folder, endpoint)
     if not camera:
@@ -61,7 +61,7 @@ async def lateness(clock: Clock, folder: Path, *, camera: bool, seconds: float) 
 
 
 def behind_grid(stamps: NDArray[np.int64]) -> Array:
-    """Milliseconds behind a grid of ``PERIOD`` that no stamp is ahead of; none is late by half a period usually."""
+    """Return the delay (ms) relative to a grid of ``PERIOD`` that no stamp precedes; most are below half a period."""
     phase = (stamps - stamps[0]) % PERIOD
     phase = (phase - int(np.median(phase)) + PERIOD // 2) % PERIOD
     return (phase - phase.min()) / 1e6
@@ -97,7 +97,7 @@ async def compare(clock: Clock, rounds: int, seconds: float) -> dict[str, Any]:
 
 
 def loop_cost(pictures: int = 300) -> tuple[float, float]:
-    """Median and greatest processor time, ms, from a picture's bytes to the bytes of its message."""
+    """Return median and maximum processor time (ms) from a picture's bytes to the bytes of its message."""
     painter = Painter(CameraConfig(), (640, 480), 0.6)
     ranges, place = np.linspace(1.0, 4.0, len(painter.azimuths)), mounted((0.0, 0.0, 0.0), CameraConfig())
     data = CameraPacket(PacketKind.PICTURE, 0, 0, jpeg(painter.picture(ranges, [], place), 0)).encode()

@@ -1,11 +1,11 @@
-"""Memory of the daemon while many clients come, ask, drive and go: it stays flat.
+"""Memory of the daemon while many clients connect, query, drive and leave: it must stay flat.
 
     python benchmarks/clients.py [--minutes 60] [--clients 200] [--processes 2]
 
-The daemon of an emulated truck runs in a process of its own. Each client is a station's session with a name of its own:
-it follows the gate, asks for the versions and sends a drive request, once in ``BEAT`` s, and after ``STAYS`` s it
-leaves and another one comes. Resident memory is sampled every ten seconds; its slope is that of a line through the
-samples after the first ten minutes, or after half of a shorter run. The last line is JSON.
+The daemon of an emulated truck runs in a separate process. Each client is a station's session with a unique name: it
+follows the gate, queries the versions and sends a drive request once in ``BEAT`` s; after ``STAYS`` s it leaves and is
+replaced. Resident memory is sampled every ten seconds. Its slope is that of a line through the samples after the first
+ten minutes, or after half of a shorter run. The last line is JSON.
 """
 
 import argparse
@@ -41,7 +41,7 @@ SLOPE_GOAL = 0.3
 
 
 async def visit(endpoint: str, name: str, seconds: float) -> None:
-    """One client, from its coming to its leaving."""
+    """Run one client, from connection to departure."""
     end = time.monotonic() + seconds
     async with TruckClient("truck", endpoint, source=name) as client:
         with client.subscribe(topics.GATE, latest()):
@@ -53,7 +53,7 @@ async def visit(endpoint: str, name: str, seconds: float) -> None:
 
 
 async def visits(endpoint: str, place: str, seed: int) -> None:
-    """One client after the other at one of the places, until cancelled."""
+    """Run clients one after the other at one of the places, until cancelled."""
     rng = np.random.default_rng(seed)
     await asyncio.sleep(float(rng.uniform(0, BEAT)))
     number = 0
@@ -64,7 +64,7 @@ async def visits(endpoint: str, place: str, seed: int) -> None:
 
 
 async def serve_clients(endpoint: str, first: int, count: int) -> None:
-    """The clients of one process."""
+    """Run the clients of one process."""
     async with asyncio.TaskGroup() as group:
         for place in range(first, first + count):
             group.create_task(visits(endpoint, f"client{place}", place))
@@ -77,13 +77,13 @@ def resident(pid: int) -> float:
 
 
 def slope(samples: list[tuple[float, float]], warm: float) -> float:
-    """MB a minute of the (minute, MB) after ``warm`` minutes."""
+    """Return the slope (MB/min) of the samples (minute, MB) after ``warm`` minutes."""
     after = np.array([sample for sample in samples if sample[0] >= warm])
     return float(np.polyfit(after[:, 0], after[:, 1], 1)[0]) if len(after) > 2 else float("nan")
 
 
 async def measure(clock: Clock, folder: Path, minutes: float, count: int, processes: int) -> list[tuple[float, float]]:
-    """Samples (minute, MB) of the daemon."""
+    """Return samples (minute, MB) of the daemon."""
     endpoint = free_endpoint()
     config = write_overlay(ROOT / "configs" / "demo.yaml", folder, endpoint)
     here = str(Path(__file__).resolve())

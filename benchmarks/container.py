@@ -1,10 +1,10 @@
-"""The image of ``systemd/container/Dockerfile``, and a lap of the emulated truck in it.
+"""Image of ``systemd/container/Dockerfile``, and a lap of the emulated truck in it.
 
     python benchmarks/container.py [--chroot] [--keep FOLDER]
 
-``buildah`` builds the image if it is installed; without it, or with ``--chroot``, each step runs by ``chroot``. Either
-way ``mmdebstrap`` makes the Debian that the first step names, because a registry of images may be out of reach (needs
-root, Debian's packages and a package index). Then the truck drives its lap as the image's user. The last line is JSON.
+``buildah`` builds the image if it is installed; without it, or with ``--chroot``, each step runs by ``chroot``. In both
+cases ``mmdebstrap`` makes the Debian named by the first step, because an image registry may be unreachable (needs root,
+Debian's packages and a package index). Then the truck drives its lap as the image's user. The last line is JSON.
 """
 
 import argparse
@@ -31,7 +31,7 @@ GOALS = {"failed_steps": 0, "lap": "path driven to its end"}
 
 
 def steps(text: str) -> Iterator[tuple[str, str]]:
-    """Instruction and arguments of each step, without comments, lines joined."""
+    """Yield instruction and arguments of each step, without comments, with joined lines."""
     plain = "\n".join(line for line in text.splitlines() if not line.startswith("#"))
     for line in plain.replace("\\\n", " ").splitlines():
         name, _, rest = line.partition(" ")
@@ -40,10 +40,10 @@ def steps(text: str) -> Iterator[tuple[str, str]]:
 
 
 class Image:
-    """A root folder, and what the steps so far say of the next command.
+    """A root folder, and the state that the steps so far define for the next command.
 
     Args:
-        folder: of the root.
+        folder: root folder.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -54,7 +54,7 @@ class Image:
         self._place, self._user = "/", "0"
 
     def step(self, name: str, rest: str) -> int:
-        """Carry out a step; returns the exit code of its command."""
+        """Execute a step; return the exit code of its command."""
         match name:
             case "FROM":
                 suite = rest.removeprefix("debian:").removesuffix("-slim")
@@ -77,7 +77,7 @@ class Image:
         return 0
 
     def run(self, command: str) -> "subprocess.CompletedProcess[str]":
-        """Run a shell command as the present user in the present folder, with this computer's certificates."""
+        """Run a shell command as the current user in the current folder, with this computer's certificates."""
         for file in (Path("/etc/resolv.conf"), CERTIFICATES):  # each time: a step may install Debian's own
             there = self.folder / file.relative_to("/")
             there.parent.mkdir(parents=True, exist_ok=True)
@@ -93,7 +93,7 @@ IMAGE = "localhost/monstertruckd-measured"
 
 
 def imported_base(name: str, folder: Path) -> None:
-    """Make the image that a container file begins with, with this computer's certificates and package index."""
+    """Make the base image of a container file, with this computer's certificates and package index."""
     suite = name.removeprefix("debian:").removesuffix("-slim")
     place = Path("usr/local/share/ca-certificates/computer.crt")  # ca-certificates adds it to its bundle
     (folder / place).parent.mkdir(parents=True)
@@ -111,7 +111,7 @@ def imported_base(name: str, folder: Path) -> None:
 
 
 def run_buildah(*words: str) -> str:
-    """Output of a command of ``buildah``."""
+    """Return the output of a ``buildah`` command."""
     done = subprocess.run(["buildah", *words], cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True)
     return done.stdout.strip()
 
@@ -137,13 +137,13 @@ LAP = ("monstertruckd", "demo", "--fast", "--output", "/tmp/lap")
 
 
 def outcome(done: "subprocess.CompletedProcess[str]") -> str:
-    """How a lap ended."""
+    """Describe the end of a lap."""
     found = re.search(r"outcome\s+(.*)", done.stdout)
     return found[1].strip() if found else (done.stderr or done.stdout).strip()[-500:]
 
 
 def carried_out(folder: Path) -> dict[str, Any]:
-    """Carry out the steps of the container file by ``chroot``, and drive the lap."""
+    """Execute the steps of the container file by ``chroot``, and drive the lap."""
     figures: dict[str, Any] = {"failed_steps": 0, "seconds": {}}
     image = Image(folder)
     for number, (instruction, rest) in enumerate(steps(FILE.read_text(encoding="utf-8")), 1):

@@ -76,7 +76,7 @@ def places(world: str, count: int, seed: int) -> list[tuple[float, float, float]
 
 
 def trial(world: str, count: int, seed: int) -> dict[str, Any]:
-    """All goals of one world."""
+    """Drive to all goals of one world."""
     x, y, yaw = BUILT_IN[world]().start
     start = {"x": x, "y": y, "yaw": yaw}
     config = with_overlay(
@@ -113,9 +113,9 @@ def trial(world: str, count: int, seed: int) -> dict[str, Any]:
 
 
 async def to_goal(rig: VirtualRig, operator: LocalOperator, goal: tuple[float, float, float]) -> str:
-    """Drive to a goal, armed again after stops that disarm; the outcome.
+    """Drive to a goal, armed again after stops that disarm; return the outcome.
 
-    A goal on which a person stands is refused; it is sent again every 5 s.
+    A goal occupied by a person is refused; it is sent again every 5 s.
     """
     clock = rig.clock
     with rig.bus.subscribe(topics.GOAL, fifo(4096)) as states, rig.bus.subscribe(topics.GATE, latest()) as gate:

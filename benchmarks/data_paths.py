@@ -1,17 +1,17 @@
-"""Files a datum passes: a scan on its way to the motor and through SLAM, a goal to the tracker, a configuration value.
+"""Files that a datum passes: a scan to the motor and through SLAM, a goal to the tracker, a configuration value.
 
     python benchmarks/data_paths.py [--files]
 
-The whole daemon runs on the virtual clock, its workers' steps in the loop. A datum is followed by identity: it passes a
-function that is given it as an argument, as itself or inside a message, dataclass, tuple or list. What such a function
-returns or constructs carries it on, and the function it returns to has it, too. Where a service keeps a datum in its
-state, the way goes on with the next message that is made from that state; those messages are named for each way. A
-configuration value is followed by its content instead, because it is parsed on its way, then through the calls that
-lead to its first reader.
+The whole daemon runs on the virtual clock, with its workers' steps in the loop. A datum is followed by identity: it
+passes every function that receives it as an argument, directly or inside a message, dataclass, tuple or list. The
+results of such a function and the objects that it constructs carry the datum on, also to its caller. Where a service
+keeps a datum in its state, the path continues with the next message made from that state; these messages are named for
+each path. A configuration value is followed by its content instead, because it is parsed on the way, then through the
+calls that lead to its first reader.
 
-Counted are the distinct files of this project that it passes in the named services, without the emulated side and the
-virtual event loop.
-``--files`` lists them in the order in which they are entered, with their lines. The last line is JSON.
+The figure is the number of distinct files of this project passed in the named services, without the emulated side and
+the virtual event loop. ``--files`` lists them in the order in which they are entered, with their lines. The last line
+is JSON.
 """
 
 import argparse
@@ -57,7 +57,7 @@ SPEED: Final = 0.1537
 
 
 def source_file(name: str, known: dict[str, str | None] = {}) -> str | None:  # noqa: B006  # a cache
-    """Path of a file of this project that is not the emulated side, from the root."""
+    """Return the path, from the root, of a file of this project that is not on the emulated side; None for others."""
     if name not in known:
         path = Path(name)
         inside = path.relative_to(ROOT) if path.is_relative_to(ROOT) else None
@@ -67,11 +67,11 @@ def source_file(name: str, known: dict[str, str | None] = {}) -> str | None:  # 
 
 
 class Trace:
-    """A profile function that notes the files a datum passes.
+    """Profile function that notes the files a datum passes.
 
     Args:
-        tasks: ends of the names of the tasks in which it is followed; "*" = those without a name of their own.
-        starts: messages whose construction is the datum, or carries it on; "bytes" = what the lidar's line gives.
+        tasks: suffixes of the names of the followed tasks; "*": unnamed tasks.
+        starts: messages whose construction is the datum, or carries it on; "bytes": the bytes of the lidar's line.
         leaves: parts of paths of files at which it has arrived.
     """
 
@@ -82,7 +82,7 @@ class Trace:
         self._passed: set[FrameType] = set()
 
     def __call__(self, frame: FrameType, event: str, result: Any) -> None:
-        """Called by the interpreter for every call and return."""
+        """Process a call or return; called by the interpreter."""
         if event == "call":
             if self._watched(frame) and self._is_given(frame):
                 self._note(frame)
@@ -169,13 +169,13 @@ class Trace:
 
 
 def _makes(frame: FrameType) -> bool:
-    """Whether a function of a library makes a message or dataclass."""
+    """Whether a library function constructs a message or dataclass."""
     code = frame.f_code
     return code.co_filename == PYDANTIC or (code.co_filename == "<string>" and code.co_name == "__init__")
 
 
 class ContentTrace(Trace):
-    """Follows a configuration value by what it says: as text, number, or part of a section."""
+    """Follows a configuration value by its content: as text, number, or part of a section."""
 
     def __init__(self) -> None:
         super().__init__((), ())
@@ -206,7 +206,7 @@ class ContentTrace(Trace):
 
 
 class StepInLoop(LoopActor):
-    """Stands in for the SLAM's worker, so that its step is in this process."""
+    """Replaces the SLAM worker, so that its step runs in this process."""
 
     pid = 1
 
@@ -215,7 +215,7 @@ class StepInLoop(LoopActor):
 
 
 def robot(name: str, **sections: Any) -> SimulatedTruckConfig:
-    """A shipped configuration without recordings."""
+    """Return a shipped configuration without recordings."""
     values = load_config(ROOT / "configs" / f"{name}.yaml", SimulatedTruckConfig)[0].model_dump()
     values |= {"recorder": None, "blackbox": None, **sections}
     return SimulatedTruckConfig.model_validate(values)
@@ -224,7 +224,7 @@ def robot(name: str, **sections: Any) -> SimulatedTruckConfig:
 def traced(
     config: SimulatedTruckConfig, trace: Trace, seconds: float, goal: tuple[float, float, float] | None = None
 ) -> list[str]:
-    """Files a datum passes while the robot drives, or plans a way to a goal."""
+    """Return the files that a datum passes while the robot drives, or plans a route to a goal."""
 
     async def main(clock: VirtualClock) -> None:
         rig = VirtualRig(config, clock)
@@ -265,13 +265,13 @@ def traced(
 
 
 def scan_to_motor() -> list[str]:
-    """A scan clips and slows what the tracker asks for."""
+    """Follow a scan that limits the tracker's request."""
     tasks = ("/lidar", "/tracker", "/gate", "/drive")
     return traced(robot("demo"), Trace(tasks, ("bytes", "DriveCommand"), STEERING_SIDE), 0.3)
 
 
 def scan_through_slam() -> list[str]:
-    """A scan moves the pose that the tracker steers by."""
+    """Follow a scan that moves the pose used by the tracker."""
     tasks = ("/lidar", "/slam", "/tracker", "/gate", "/drive", "*")
     trace = Trace(
         tasks,
@@ -283,7 +283,7 @@ def scan_through_slam() -> list[str]:
 
 
 def goal_to_tracker() -> list[str]:
-    """A goal becomes a route, the route a path round what stands there, which the tracker takes in."""
+    """Follow a goal that becomes a route, and then a path around obstacles, which the tracker accepts."""
     starts = ("GoalRequest", "PlanTask", "RouteAnswer", "DeformTask", "DeformAnswer", "Path")
     config = robot("goals", placement={"planner": "loop", "local_planner": "loop"})
     trace = Trace(("/goals", "*"), starts)
@@ -291,7 +291,7 @@ def goal_to_tracker() -> list[str]:
 
 
 def configuration_value() -> list[str]:
-    """The gate's greatest speed, from the file's line to the gate."""
+    """Follow the gate's maximum speed from the line in the file to the gate."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "robot.yaml"
         file.write_text(f"include: {ROOT / 'configs' / 'demo.yaml'}\ngate: {{speed: {SPEED}}}\n", encoding="utf-8")

@@ -1,9 +1,9 @@
-"""A daemon that is killed, frozen or asked to end while the truck drives: seconds and metres to standstill.
+"""Daemon killed, frozen or terminated while the truck drives: seconds and metres to standstill.
 
     python -m benchmarks.deaths [--trials 20]
 
-Emulated devices in one process, the daemon in another, on the wall clock; every trial begins at the start of the lap,
-at 0.18 m/s, at another moment of the lap. The true speed is the simulator's. Half an hour.
+Emulated devices run in one process, the daemon in another, on the wall clock. Every trial begins at the start of the
+lap, at 0.18 m/s, at a different moment of the lap. The true speed is the simulator's. Takes half an hour.
 """
 
 import argparse
@@ -32,12 +32,12 @@ WATCHED = 3.0
 
 
 async def kill(truck: Robot) -> float:
-    """SIGKILL; returns when, s."""
+    """SIGKILL the daemon; return the instant, s."""
     return await send(truck, signal.SIGKILL)
 
 
 async def kill_and_stop(truck: Robot) -> float:
-    """SIGKILL, and the stop script as soon as the process is gone."""
+    """SIGKILL the daemon, and run the stop script as soon as the process is gone."""
     began = await send(truck, signal.SIGKILL)
     await end(truck.daemon, signal.SIGKILL)
     script = [sys.executable, "-I", str(ROOT / "systemd" / "neutral.py"), str(truck.folder / "dev" / "drive")]
@@ -46,24 +46,24 @@ async def kill_and_stop(truck: Robot) -> float:
 
 
 async def freeze(truck: Robot) -> float:
-    """SIGSTOP."""
+    """SIGSTOP the daemon."""
     return await send(truck, signal.SIGSTOP)
 
 
 async def freeze_and_continue(truck: Robot) -> float:
-    """SIGSTOP for a while, then SIGCONT; returns when it went on."""
+    """SIGSTOP the daemon for a while, then SIGCONT; return the instant of the latter."""
     await send(truck, signal.SIGSTOP)
     await asyncio.sleep(FROZEN)
     return await send(truck, signal.SIGCONT)
 
 
 async def terminate(truck: Robot) -> float:
-    """SIGTERM."""
+    """SIGTERM the daemon."""
     return await send(truck, signal.SIGTERM)
 
 
 async def send(truck: Robot, number: int) -> float:
-    """Signal the daemon; returns when, s."""
+    """Signal the daemon; return the instant, s."""
     assert truck.daemon is not None
     began = truck.clock.now() / SECOND
     truck.daemon.send_signal(number)
@@ -72,7 +72,7 @@ async def send(truck: Robot, number: int) -> float:
 
 @dataclass(frozen=True)
 class Way:
-    """How a daemon leaves the truck alone."""
+    """A way in which the daemon abandons the truck."""
 
     act: Callable[[Robot], Awaitable[float]]
     overlay: dict[str, Any]
@@ -90,7 +90,7 @@ WAYS = {
 
 
 async def trial(way: Way, cruise: float) -> tuple[float, float]:
-    """Seconds (infinite: it never stood) and metres to standstill."""
+    """Return the seconds (infinite: never) and metres to standstill."""
     with TemporaryDirectory(prefix="monstertruck-") as folder:
         async with robot(Path(folder), way.overlay) as truck:
             await truck.start_simulator()
@@ -109,7 +109,7 @@ async def trial(way: Way, cruise: float) -> tuple[float, float]:
 
 
 def main() -> int:
-    """All ways; 0 = the goals are met."""
+    """Try all ways; 0: all goals are met."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--trials", type=int, default=20)
     trials = parser.parse_args().trials

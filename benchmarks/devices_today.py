@@ -1,11 +1,11 @@
-"""Devices that builders buy today, each at its emulator: clocks, trouble, and how soon an actuator stands without host.
+"""Current devices, each at its emulator: clocks, disturbances, and the time until an actuator without host stands.
 
-One row for each device. `stand_ms`: from the last byte of a host that died to standstill of all motors, worst of all
-tries. `clock_ms`: greatest error of the stamps. `lost_ms`: from the loss of a transmitter to the message that says so,
-worst of all tries. `step`, `deskew_mm`: of lidars (`devices_today_parts/lidars.py`). `trouble`: passed of loss, damage,
-stalls, single bytes and unplugging, after each of which the driver must serve again, and of a stranger that it must
-refuse. `foreign`: the test in which another implementation agrees with the emulator's bytes. All on the virtual clock.
-The last line is JSON.
+One row for each device. `stand_ms`: from the last byte of a dead host to standstill of all motors, the worst of all
+trials. `clock_ms`: maximum error of the stamps. `lost_ms`: from the loss of a transmitter to the message that reports
+it, the worst trial. `step`, `deskew_mm`: of lidars (`devices_today_parts/lidars.py`). `trouble`: passed tests of
+loss, damage, stalls, single bytes and unplugging, after each of which the driver must serve again, and of a wrong
+device, which it must refuse. `foreign`: test in which another implementation agrees with the emulator's bytes. All runs
+use the virtual clock. The last line is JSON.
 
     python benchmarks/devices_today.py [DEVICE ...]
 """

@@ -49,7 +49,7 @@ GOALS = {"share": 0.99, "contacts": 0}
 
 
 def way(direction: str) -> Array:
-    """Poses (n, 3) of the manoeuvre, relative to the docked pose that faces the dock."""
+    """Return the poses (n, 3) of the manoeuvre, relative to the docked pose."""
     ahead = STAGING + 0.1 + (2 * RADIUS if direction == "reverse" else 0.0)
     axis = [(-x, 0.0, 0.0) for x in np.arange(0.15 if direction == "reverse" else 0.0, ahead, 0.05)]
     if direction == "forward":
@@ -90,7 +90,7 @@ def pose(row: Array) -> dict[str, float]:
 
 
 def trial(seed: int, direction: str) -> dict[str, Any]:
-    """One docking."""
+    """Simulate one docking."""
     rng = np.random.default_rng([53, seed])
     world = WORLDS[seed % len(WORLDS)]
     facing = place(world, direction, rng)
@@ -173,7 +173,7 @@ def main() -> None:
 
 
 def sums(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Figures of one direction."""
+    """Return the figures of one direction."""
     done = [row for row in rows if row["outcome"] == Reason.BEHAVIOUR_DONE.value]
     return {
         "runs": len(rows),

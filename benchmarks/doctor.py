@@ -1,4 +1,4 @@
-"""The doctor against faults drawn by seed from a catalogue: which are found, with what mends, and what is said falsely.
+"""The doctor against faults drawn from a catalogue: found faults, their fixes, and false findings.
 
     python -m benchmarks.doctor [--seeds 100]
     python -m benchmarks.doctor --drive 20
@@ -6,9 +6,8 @@
 First every fault of ``tests/unit/tools/doctor/catalogue.py`` alone, then ``--seeds`` computers with up to six of them
 at once, then a healthy one. The computers are folders with emulated USB trees, networks and logs.
 
-``--drive``: so many trucks, at random places of the built-in worlds, that the doctor drives 20 cm through the whole
-daemon on the virtual clock: every second one is healthy, with servos as a calibration leaves them, the others have one
-of the wrong signs.
+``--drive``: number of trucks, at random places of the built-in worlds, that the doctor drives 20 cm through the whole
+daemon on the virtual clock. Every second one is healthy, with calibrated servos; each of the others has one wrong sign.
 """
 
 import argparse
@@ -49,14 +48,14 @@ GOALS = {"catalogue": 40, "not_found": 0, "without_mend": 0, "false": 0}
 
 
 def wrong_with(faults: Sequence[Fault], *, drove: bool = False) -> list[str]:
-    """Mistakes on one computer."""
+    """Return the doctor's mistakes on one computer."""
     with TemporaryDirectory(prefix="monstertruck-") as folder:
         before = log(*weaving()) if drove else lambda _: None
         return mistakes(examined(Path(folder), faults, before), faults)
 
 
 def driven(seed: int, wrong: str | None) -> list[Finding]:
-    """What is found of one truck that is driven."""
+    """Return the findings about one driven truck."""
     rng = np.random.default_rng([seed, 27])
     name = WORLDS[seed // 2 % len(WORLDS)]
     built = BUILT_IN[name]().map
@@ -90,7 +89,7 @@ def driven(seed: int, wrong: str | None) -> list[Finding]:
 
 
 def drives(count: int) -> int:
-    """Drive; 0 = nothing false on a healthy truck, and every wrong sign is named, and alone."""
+    """Drive; 0: no false finding on a healthy truck, and every wrong sign is named alone."""
     logging.disable(logging.CRITICAL)
     false, missed = 0, 0
     for seed in range(count):

@@ -1,17 +1,17 @@
-"""1000 seeded faults on the whole truck, on the virtual clock: no unsafe motion, nothing stuck, back soon.
+"""1000 seeded faults on the whole truck, on the virtual clock: no unsafe motion, no stuck robot, quick recovery.
 
     python benchmarks/drill.py [--seed 1] [--count 1000] [--fault KIND ...] [--jobs N]
                                [--resume FILE]
     python benchmarks/drill.py --families [--count 10000] [--from N] [--robot NAME] [...]
 
-What is unsafe is judged by an observer that sees only bytes on the wires of drive and steering, and the world's truth.
+An observer judges what is unsafe from the bytes on the wires of drive and steering and from the world's truth alone.
 
-``--fault`` draws faults of these kinds alone, as the report names them: "electronics rail lost" takes both hubs.
+``--fault`` draws faults of these kinds only, with their names in the report: "electronics rail lost" affects both hubs.
 
-``--families`` draws from the families that the devices' own signals have, too: each value falsified, each command
-ignored, singles and pairs, in both directions, judged by the world's truth alone. ``--from`` begins at that trial, so
-that several computers can share the work: the files of ``--resume`` of the parts, joined, are one of the whole.
-``--robot`` is a file of configs or configs/robots, without its suffix: ``goals`` drives to goals of its planner.
+``--families`` also draws from the families of the devices' own signals: each value falsified, each command ignored,
+singles and pairs, in both directions, judged by the world's truth alone. ``--from`` begins at that trial, so that
+several computers can share the work: their joined ``--resume`` files equal one of the whole. ``--robot`` is a file of
+configs or configs/robots, without its suffix: ``goals`` drives to goals of its planner.
 """
 
 import argparse
@@ -40,7 +40,7 @@ RECOVERY_GOAL = 2.0
 
 
 def table(report: DrillReport) -> None:
-    """One row for every kind of fault; seconds and metres are the greatest."""
+    """Print one row for every kind of fault; seconds and metres are maxima."""
     kinds: dict[str, list[FaultOutcome]] = defaultdict(list)
     for outcome in report.outcomes:
         kinds[outcome.kind.value].append(outcome)
@@ -63,7 +63,7 @@ def table(report: DrillReport) -> None:
 
 
 def family_table(report: CampaignReport) -> None:
-    """One row for every family; seconds to the reason."""
+    """Print one row for every family, with the seconds to the reason."""
     print("| family | trials | with a reason | reason | s, p50 | greatest | unsafe | stuck |")
     print("|---|---:|---:|---|---:|---:|---:|---:|")
     summaries = by_family(report.outcomes)
@@ -76,7 +76,7 @@ def family_table(report: CampaignReport) -> None:
 
 
 def drill_families(arguments: argparse.Namespace) -> int:
-    """Drill families; 0 = all goals met."""
+    """Drill families; 0: all goals are met."""
     name = arguments.robot or "full"
     folder = ROOT / "configs" if (ROOT / "configs" / f"{name}.yaml").exists() else ROOT / "configs" / "robots"
     config = load_config(folder / f"{name}.yaml", SimulatedTruckConfig)[0]
@@ -97,13 +97,13 @@ def drill_families(arguments: argparse.Namespace) -> int:
 
 
 def write(name: str, data: dict[str, Any]) -> None:
-    """Keep all outcomes."""
+    """Save all outcomes."""
     OUTPUT.mkdir(parents=True, exist_ok=True)
     (OUTPUT / f"{name}.json").write_text(json.dumps(data, indent=1), encoding="utf-8")
 
 
 def main() -> int:
-    """Drill; 0 = nothing unsafe, nothing stuck, back within the goal."""
+    """Drill; 0: no unsafe motion, no stuck robot, recovery within the goal."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, help="1000; 10000 of families")

@@ -1,11 +1,10 @@
-"""Kills, power cuts and damaged files: nothing that was acknowledged is lost, nothing is mixed, nothing is a traceback.
+"""Kills, power cuts and damaged files: acknowledged data survives, saves are never mixed, errors are never tracebacks.
 
     python -m benchmarks.durability [--kills 1000] [--cuts 200] [--logs 2000] [--files 20000] [--from 0] [PART ...]
 
 Parts: ``kills`` ends the writers of all subjects (``durability_parts/deaths.py``) by SIGKILL at any moment; ``cuts``
-plays the traces of their writes to a disk that forgets what was not synced, and cuts its power at any point; ``logs``
-damages recordings and repairs them (``damage.py``); ``files`` mutates files of every kind that users hand in
-(``files.py``).
+replays the traces of their writes to a disk that loses unsynced data, and cuts its power at any point; ``logs`` damages
+recordings and repairs them (``damage.py``); ``files`` mutates files of every kind that users supply (``files.py``).
 """
 
 import argparse
@@ -58,7 +57,7 @@ def _cuts(subjects: list[Subject], count: int, seed: int, work: Path) -> dict[st
 
 
 def _met(figures: dict[str, Any]) -> bool:
-    """Whether all parts ran as often as the goals say, without a fault."""
+    """Whether all parts ran as often as the goals require, without a fault."""
     for part in PARTS:
         rows = figures.get(part, {}).values()
         if not all(isinstance(row, dict) for row in rows):

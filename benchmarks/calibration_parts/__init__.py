@@ -1,1 +1,1 @@
-"""Parts of the calibration's benchmark."""
+"""Parts of the calibration benchmark."""

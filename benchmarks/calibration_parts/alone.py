@@ -1,7 +1,7 @@
-"""Each of the other wizards alone through the whole daemon: on robots of which only what it measures is hidden.
+"""Each of the other wizards alone through the whole daemon, on robots that hide only the quantities it measures.
 
-Judged is, for every wizard, the share of its numbers that lie in their intervals, and that every choice (a sign, a
-direction) is right.
+For every wizard the benchmark judges the share of its estimates whose interval contains the truth, and that every
+choice (a sign, a direction) is right.
 """
 
 import logging
@@ -39,7 +39,7 @@ GOAL: Final = 0.9
 
 
 def alone(count: int, engine: str = "plane") -> tuple[dict[str, Any], dict[str, Any], bool]:
-    """Each wizard on so many robots, in the world of an engine; goals; whether they are met."""
+    """Run each wizard on this many robots in an engine's world; return figures, goals, and whether they are met."""
     logging.disable(logging.CRITICAL)
     inside, wrong = {}, {}
     for name, wizard in WIZARDS.items():

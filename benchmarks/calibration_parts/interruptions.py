@@ -1,12 +1,12 @@
-"""What can end a wizard half-way, at random instants: is the old file intact, the truck neutral, and does it go on?
+"""Interruptions of a wizard at random instants: the old file is intact, the truck neutral, and the wizard runs again.
 
-Every trial runs the whole daemon on the virtual clock: the drive wizard measures, something happens, the truck has
-to be at rest with its gate closed and the calibration as it was; then the cause is removed and the wizard is run again.
-After what passes by itself, a cable or a link that is out for a second, a wizard may also go on: then the truck has to
-have stood with its gate closed meanwhile, and the wizard has to save its result.
+Every trial runs the whole daemon on the virtual clock. The drive wizard measures and is interrupted; the truck must
+then be at rest with its gate closed and the calibration unchanged. The cause is removed, and the wizard runs again.
+After a short interruption, a cable or link lost for a second, a wizard may also continue: the truck must then have
+stood with its gate closed meanwhile, and the wizard must save its result.
 
-A daemon that is killed takes its cables with it; the stop script's commands (``systemd/neutral.py``) reach the drive
-afterwards, and a new daemon starts, as systemd has it.
+A killed daemon closes its ports; the stop script's commands (``systemd/neutral.py``) then reach the drive, and a new
+daemon starts, as under systemd.
 """
 
 import asyncio
@@ -67,7 +67,7 @@ OLD = Result(
 
 @dataclass
 class Trial:
-    """What went wrong in one trial; nothing: an empty list."""
+    """Faults of one trial; none: an empty list."""
 
     kind: str
     instant: float
@@ -75,11 +75,11 @@ class Trial:
 
 
 class Interrupted:
-    """A truck, a wizard that measures, and what may happen to them.
+    """A truck, a measuring wizard, and the possible interruptions.
 
     Args:
         rig: the truck.
-        clock: of the rig.
+        clock: clock of the rig.
     """
 
     def __init__(self, rig: VirtualRig, clock: VirtualClock) -> None:
@@ -89,71 +89,71 @@ class Interrupted:
         self.wizard: asyncio.Task[Any] = asyncio.create_task(self.measure(DriveWizard()))
 
     async def measure(self, wizard: DriveWizard) -> Result:
-        """Run the wizard to its end, or to what ends it."""
+        """Run the wizard until its end or interruption."""
         panel = SimulatedOperator(self.rig, np.random.default_rng(1))
         truck: Any = self.truck
         result, _ = await calibrate(wizard, truck, panel, self.clock, self.rig.config, {})
         return result
 
     def files(self) -> dict[Path, bytes]:
-        """The calibration as it is on the disk."""
+        """Return the calibration files on the disk."""
         return {path: path.read_bytes() for path in self.store.files()}
 
     @property
     def speed(self) -> float:
-        """True one, m/s."""
+        """True speed, m/s."""
         return abs(self.rig.world.truth(self.clock.now()).v)
 
     def operator(self) -> LocalOperator:
-        """Somebody with a gamepad."""
+        """An operator with a gamepad."""
         return LocalOperator(self.rig.daemon, self.clock, "somebody", Role.GAMEPAD)
 
     # What happens, and what takes it back
 
     async def ctrl_c(self) -> None:
-        """The operator gives up."""
+        """Interrupt the wizard."""
         self.wizard.cancel()
 
     async def unplug(self) -> None:
-        """The drive's cable is out for a second; its motor keeps its speed meanwhile."""
+        """Unplug the drive for a second; its motor keeps its speed meanwhile."""
         self.rig.context.device("drive").port.unplug()
         await self.clock.sleep(1.0)
         self.rig.context.device("drive").port.plug()
 
     async def estop(self) -> None:
-        """Somebody stops the truck."""
+        """Send an emergency stop."""
         await self.operator().estop()
 
     async def reset(self) -> None:
-        """And takes that back."""
+        """Reset the emergency stop."""
         await self.operator().reset()
 
     async def low_battery(self) -> None:
-        """The pack is as good as empty."""
+        """Discharge the pack."""
         self.rig.world.set_charge(self.clock.now(), 0.01)
 
     async def charge(self) -> None:
-        """Another pack."""
+        """Replace the pack."""
         self.rig.world.set_charge(self.clock.now(), 0.95)
         await self.clock.sleep(45.0)  # the battery counts as full only after a while
 
     async def lose_lease(self) -> None:
-        """The link is gone for a second."""
+        """Cut the link for a second."""
         self.truck.silent = True
         await self.clock.sleep(1.0)
         self.truck.silent = False
 
     async def kill_wizard(self) -> None:
-        """SIGKILL: nothing more comes from it."""
+        """Kill the wizard: it sends nothing more."""
         self.truck.silent = True
         self.wizard.cancel()
 
     async def hear_again(self) -> None:
-        """A new process of the wizard."""
+        """Start a new process of the wizard."""
         self.truck.silent = False
 
     async def kill_daemon(self) -> None:
-        """SIGKILL, the stop script, and a new daemon."""
+        """Kill the daemon, run the stop script, and start a new daemon."""
         ports = list(self.rig.ports.values())
         for port in ports:
             port.unplug()
@@ -173,7 +173,7 @@ class Interrupted:
         self.truck = SilentTruck(self.rig.daemon, self.clock)
 
     async def nothing(self) -> None:
-        """There is nothing to take back."""
+        """No cause to remove."""
 
 
 Happens = Callable[[Interrupted], Awaitable[None]]
@@ -190,7 +190,7 @@ KINDS: dict[str, tuple[Happens, Happens]] = {
 
 
 def trial(kind: str, seed: int) -> Trial:
-    """One interruption."""
+    """Run one trial."""
     logging.disable(logging.CRITICAL)
     instant = float(np.random.default_rng([seed, 28]).uniform(FIRST, LAST))
     found = Trial(kind, round(instant, 2))
@@ -257,7 +257,7 @@ async def _interrupt(bench: Interrupted, found: Trial) -> None:
 
 
 async def _outlasted(bench: Interrupted, stood: bool, found: Trial) -> bool:
-    """Whether the wizard goes on to its end after what passed."""
+    """Whether the wizard continues to its end after the interruption."""
     before = bench.files()
     if not bench.wizard.done():
         if not stood:
@@ -269,7 +269,7 @@ async def _outlasted(bench: Interrupted, stood: bool, found: Trial) -> bool:
 
 
 async def _stands(bench: Interrupted) -> bool:
-    """Whether the truck comes to stand with its gate closed soon."""
+    """Whether the truck soon stands with its gate closed."""
     async with _mode(bench) as gate:
         for _ in range(round(STOPPED / STEP)):
             await bench.clock.sleep(STEP)
@@ -285,7 +285,7 @@ async def _mode(bench: Interrupted) -> AsyncIterator[Any]:
 
 
 def interruptions(count: int) -> tuple[dict[str, Any], dict[str, Any], bool]:
-    """So many of each kind: how many left everything as it should be; goals; whether they are met."""
+    """Run this many trials of each kind; return the successful ones, the goals, and whether they are met."""
     good: dict[str, int] = {}
     for kind in KINDS:
         trials = [trial(kind, seed) for seed in range(count)]

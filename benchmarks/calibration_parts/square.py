@@ -1,9 +1,9 @@
-"""How far dead reckoning is off after a square of 10 m: of a truck whose signs alone are known, and after ``all``.
+"""Closing error of dead reckoning after a square of 10 m, with the signs calibrated only, and after ``calibrate all``.
 
-A truck whose values are all hidden is calibrated in the order of ``calibrate all`` through the whole daemon. Then it
-drives a square, sides by its own count and corners by its own odometry, and the closing error is the distance between
-where odometry and truth say that it came to. The same is done with nothing of the calibration but the directions of
-motor and servos, without which no truck drives a square.
+A truck with hidden values is calibrated in the order of ``calibrate all`` through the whole daemon. Then it drives a
+square: sides by its own count, corners by its own odometry. The closing error is the distance between the end points by
+odometry and by the truth. The same drive is repeated with only the directions of motor and servos calibrated, which a
+truck needs to drive a square at all.
 """
 
 import logging
@@ -42,7 +42,7 @@ HIDDEN: Final = ("battery", "compass", "drive", "steering", "odometry", "lidar")
 
 
 def truck(seed: int, folder: Path) -> SimulatedTruckConfig:
-    """One with hidden values, whose calibration is in ``folder``."""
+    """Return a truck with hidden values, whose calibration is in ``folder``."""
     base = load_config(ROOT / "configs" / "yard.yaml", SimulatedTruckConfig)[0]
     quiet = base.model_copy(update={"recorder": None, "blackbox": None, "state_directory": folder})
     return hidden(quiet, np.random.default_rng([seed, 31]), seed, HIDDEN)
@@ -55,7 +55,7 @@ def results_of(config: SimulatedTruckConfig) -> list[Result]:
 
 
 def left(config: SimulatedTruckConfig) -> list[WizardRun]:
-    """Wizards that it still needs."""
+    """Return the wizards still to be run."""
     return missing(config, {result.wizard: result for result in results_of(config)})
 
 
@@ -71,7 +71,7 @@ def step(config: SimulatedTruckConfig, seed: int) -> None:
 
 
 def signs(results: Sequence[Result]) -> list[Result]:
-    """What of them says which way motor and servos turn."""
+    """Return the results that state the directions of motor and servos."""
     kept = [(result, tuple(e for e in result.estimates if e.name in SIGNS)) for result in results]
     return [result.model_copy(update={"estimates": estimates}) for result, estimates in kept if estimates]
 
@@ -104,20 +104,20 @@ def closing_error(config: SimulatedTruckConfig) -> float:
 
 
 def _moved(began: tuple[float, float, float], ended: tuple[float, float]) -> tuple[float, float]:
-    """Where something came to, in the axes of where it began, m."""
+    """Return the end in the axes of the start, m."""
     dx, dy = ended[0] - began[0], ended[1] - began[1]
     c, s = math.cos(began[2]), math.sin(began[2])
     return c * dx + s * dy, c * dy - s * dx
 
 
 def compared(config: SimulatedTruckConfig) -> tuple[float, float]:
-    """Closing errors of a calibrated truck: with its signs alone, and with everything, m."""
+    """Return the closing errors (m) with the signs calibrated only, and with the whole calibration."""
     results = results_of(config)
     return tuple(closing_error(with_values(config, some, "calibration")) for some in (signs(results), results))  # type: ignore[return-value]
 
 
 def square(count: int) -> tuple[dict[str, Any], dict[str, Any], bool]:
-    """Closing errors of so many trucks; goals; whether they are met."""
+    """Measure this many trucks; return closing errors, goals, and whether they are met."""
     logging.disable(logging.CRITICAL)
     before, after = [], []
     for seed in range(count):

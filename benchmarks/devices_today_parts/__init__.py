@@ -1,1 +1,1 @@
-"""Rows of ``devices_today``: modules with a table ``ROWS`` of functions by device; ``kit`` is what they share."""
+"""Rows of ``devices_today``: modules with a table ``ROWS`` of functions by device, and the shared module ``kit``."""

@@ -29,14 +29,14 @@ TRIES = 20
 
 
 class DriveBench(Bench):
-    """Motors that are commanded 50 times a second.
+    """Motors commanded 50 times a second.
 
     Args:
-        clock: time.
-        emulator: makes the emulated controller of two rotors.
-        driver: makes the driver from port, events and the ends of its topics.
-        rate: that is commanded, rad/s.
-        motors: the controller has.
+        clock: source of time.
+        emulator: creates the emulated controller of two rotors.
+        driver: creates the driver from port, events and the ends of its topics.
+        rate: commanded rate, rad/s.
+        motors: number of motors of the controller.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class DriveBench(Bench):
         super().__init__(clock, emulator(self.rotors), lambda port, events: driver(port, events, ends))
 
     async def command(self) -> None:
-        """The gate's ticks."""
+        """Send a command at every tick of the gate."""
         while True:
             now = self.clock.now()
             for box in self.commands:
@@ -83,7 +83,7 @@ class DriveBench(Bench):
         return max(abs(rotor.reading(self.clock.now()).rpm) for rotor in self.rotors) * RPM
 
     def healthy(self) -> bool:
-        """Whether both rotors turn as commanded, and that is reported."""
+        """Whether both rotors turn as commanded, and the driver reports it."""
         slow = [abs(r.reading(self.clock.now()).rpm * RPM - self.rate) > 0.05 * self.rate for r in self.rotors]
         fresh = all(
             self.clock.now() - out.kept[-1].received < 0.2 * SECOND for out in self.outs[: len(self.rotors)] if out.kept
@@ -92,7 +92,7 @@ class DriveBench(Bench):
 
 
 async def stand(bench: DriveBench, after: float) -> float:
-    """Milliseconds from the death of the host to standstill."""
+    """Return the time (ms) from the death of the host to standstill."""
     async with running(bench.command(), bench.serve()):
         await bench.clock.sleep(4.0 + after)
         assert bench.fastest > 0.9 * bench.rate
@@ -104,7 +104,7 @@ async def stand(bench: DriveBench, after: float) -> float:
 
 
 async def clock_error(bench: DriveBench) -> float:
-    """Greatest error of the stamps at a constant speed, ms: by how much a position is another instant's."""
+    """Return the maximum error of the stamps at a constant speed, ms."""
     async with running(bench.command(), bench.serve()):
         await bench.clock.sleep(5.0)
         first = len(bench.outs[0].kept)
@@ -131,15 +131,15 @@ def row(
     watched: bool = True,
     talks: bool = True,
 ) -> dict[str, Any]:
-    """All measurements of one controller.
+    """Measure one controller.
 
     Args:
-        make: makes the bench.
-        foreign: where another implementation is compared.
-        stalls: faults of the emulator, the first of which silences it: how to start and end each.
-        measures: whether it measures its motors at all.
-        watched: whether it notices a dead host.
-        talks: whether a device on its port may send by itself; on an I2C bus none does.
+        make: creates the bench.
+        foreign: test of another implementation.
+        stalls: faults of the emulator, the first of which silences it: commands to start and end each.
+        measures: whether it measures its motors.
+        watched: whether it detects a dead host.
+        talks: whether a device on its port may send unrequested; on an I2C bus none does.
     """
     stands = [on_bench(make, lambda bench, i=i: stand(bench, i * 0.0037)) for i in range(TRIES if watched else 0)]
 

@@ -1,4 +1,4 @@
-"""Rows of the BNO085 and of the radio control receivers."""
+"""Rows of the BNO085 and of the radio receivers."""
 
 import math
 from collections.abc import Callable
@@ -25,7 +25,7 @@ RATE = 2.0
 
 
 class Swinging:
-    """A unit that turns to and fro."""
+    """A unit that swings to and fro."""
 
     def imu(self, time_ns: int) -> ImuReading:
         """See ``ImuSource``."""
@@ -38,21 +38,21 @@ def turn_rate(seconds: float | np.ndarray) -> Any:
 
 
 class SensorBench(Bench):
-    """A sensor and its newest messages."""
+    """A sensor and its latest messages."""
 
     def __init__(self, clock: VirtualClock, emulator: Any, driver: Callable[..., Any]) -> None:
         self.out: Newest[Any] = Newest()
         super().__init__(clock, emulator, lambda port, events: driver(port, events, self.out))
 
     def healthy(self) -> bool:
-        """Whether something came lately."""
+        """Whether a message was received recently."""
         return bool(self.out.kept) and self.clock.now() - self.out.kept[-1].received < 0.2 * SECOND
 
 
 def trouble(
     make: Callable[[VirtualClock], SensorBench], healthy: str, *stalls: tuple[str, str], mute: str = "silent on"
 ) -> str:
-    """Passed of all trouble; ``mute`` is the fault that makes the emulator say nothing."""
+    """Return the passed tests; ``mute`` is the fault that silences the emulator."""
 
     async def all_of_it(bench: SensorBench) -> dict[str, bool]:
         async with running(bench.serve()):
@@ -69,7 +69,7 @@ def trouble(
 
 
 def bno085() -> dict[str, Any]:
-    """A unit that swings at 0.5 Hz by 2 rad/s."""
+    """A unit that swings at 0.5 Hz with up to 2 rad/s."""
 
     def make(clock: VirtualClock) -> SensorBench:
         def driver(port: Any, events: Any, out: Newest[Imu]) -> Bno085Driver:
@@ -78,7 +78,7 @@ def bno085() -> dict[str, Any]:
         return SensorBench(clock, Bno085Emulator(clock, Swinging()), driver)
 
     async def clock_error(bench: SensorBench) -> float:
-        """Delay that fits best between measured and true turn rates, ms."""
+        """Return the delay (ms) with the best fit between measured and true turn rates."""
         async with running(bench.serve()):
             await bench.clock.sleep(22.0)
         stamps = np.array([one.stamp for one in bench.out.kept[50:]]) / SECOND
@@ -95,15 +95,15 @@ def bno085() -> dict[str, Any]:
 
 
 class HandBench(SensorBench):
-    """A receiver whose stick is at its end and whose switch is on."""
+    """A receiver with its stick at the end stop and its switch on."""
 
     def held(self) -> bool:
-        """Whether stick and switch are reported as they are."""
+        """Whether stick and switch are reported correctly."""
         return self.healthy() and self.out.kept[-1].arm and self.out.kept[-1].speed > 0.99
 
 
 def receiver(config: ReceiverConfig, foreign: str) -> dict[str, Any]:
-    """A receiver: how late a stick's movement is known, and its loss."""
+    """A receiver: latency of a stick's movement, and detection of its loss."""
 
     def make(clock: VirtualClock) -> HandBench:
         def driver(port: Any, events: Any, out: Newest[HandControls]) -> ReceiverDriver:
@@ -115,7 +115,7 @@ def receiver(config: ReceiverConfig, foreign: str) -> dict[str, Any]:
         return bench
 
     async def lost(bench: HandBench, after: float) -> float:
-        """Milliseconds from the loss of the transmitter to the message that says so."""
+        """Return the time (ms) from the loss of the transmitter to the message that reports it."""
         async with running(bench.serve()):
             await bench.clock.sleep(2.0 + after)
             bench.emulator.inject("transmitter", "off")

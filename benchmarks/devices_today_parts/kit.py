@@ -1,4 +1,4 @@
-"""A driver at its emulator on the virtual clock: what comes out, and trouble on its way."""
+"""A driver at its emulator on the virtual clock: its output, and disturbances of its link."""
 
 import asyncio
 import contextlib
@@ -18,13 +18,13 @@ PAUSE = 0.1
 
 
 class Newest(Generic[M]):
-    """Publisher that keeps everything."""
+    """Publisher that keeps all messages."""
 
     def __init__(self) -> None:
         self.kept: list[M] = []
 
     def next_seq(self) -> int:
-        """Number of the next message."""
+        """Sequence number of the next message."""
         return len(self.kept)
 
     def put(self, message: M) -> None:
@@ -33,12 +33,12 @@ class Newest(Generic[M]):
 
 
 class Bench:
-    """One driver, whose sessions follow each other, and its emulator.
+    """A driver, whose sessions follow each other, and its emulator.
 
     Args:
-        clock: time.
-        emulator: of the device.
-        make: makes the driver from its port and the sink of events.
+        clock: source of time.
+        emulator: emulator of the device.
+        make: creates the driver from its port and the sink of events.
     """
 
     def __init__(self, clock: VirtualClock, emulator: Any, make: Callable[[MemoryPort, Any], Any]) -> None:
@@ -50,7 +50,7 @@ class Bench:
         """Why sessions ended."""
 
     async def serve(self) -> None:
-        """Session after session."""
+        """Run one session after the other."""
         while True:
             try:
                 await self.driver.run(lambda: None)
@@ -61,7 +61,7 @@ class Bench:
 
 @contextlib.asynccontextmanager
 async def running(*jobs: Coroutine[Any, Any, Any]) -> Any:
-    """Jobs that run in the background."""
+    """Run jobs in the background."""
     tasks = [asyncio.create_task(job) for job in jobs]
     try:
         yield
@@ -76,7 +76,7 @@ R = TypeVar("R")
 
 
 def on_bench(make: Callable[[VirtualClock], B], test: Callable[[B], Awaitable[R]]) -> R:
-    """Return what ``test`` finds at a bench whose emulator runs and is plugged in."""
+    """Return the result of ``test`` on a bench whose emulator runs and is plugged in."""
 
     async def main(clock: VirtualClock) -> R:
         bench = make(clock)
@@ -89,7 +89,7 @@ def on_bench(make: Callable[[VirtualClock], B], test: Callable[[B], Awaitable[R]
 
 
 async def stranger_refused(bench: Bench) -> bool:
-    """Whether the driver refuses another device on its port."""
+    """Whether the driver refuses a different device on its port."""
 
     async def talk() -> None:
         while True:
@@ -117,12 +117,12 @@ LINE = {
 
 
 async def survived(bench: Bench, healthy: Callable[[], bool], *stalls: tuple[str, str]) -> dict[str, bool]:
-    """Return after which trouble the driver serves again.
+    """Return, for each disturbance, whether the driver serves again.
 
     Args:
-        bench: with ``serve`` running.
-        healthy: whether all is as it should be.
-        stalls: faults of the emulator: how to start and end each.
+        bench: bench whose ``serve`` is running.
+        healthy: whether the device works.
+        stalls: faults of the emulator: commands to start and end each.
     """
     found: dict[str, bool] = {}
     faults, clock = bench.port.device.faults, bench.clock
@@ -148,6 +148,6 @@ async def survived(bench: Bench, healthy: Callable[[], bool], *stalls: tuple[str
 
 
 def score(found: dict[str, bool]) -> str:
-    """Passed of all, with the names of those that failed."""
+    """Format the number of passed tests, with the names of the failed ones."""
     failed = [name for name, passed in found.items() if not passed]
     return f"{len(found) - len(failed)}/{len(found)}" + (f" ({', '.join(failed)})" if failed else "")

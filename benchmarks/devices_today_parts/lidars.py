@@ -1,8 +1,8 @@
-"""Rows of the lidars, in the middle of a square room, on a robot that turns by 1 rad/s either way.
+"""Rows of the lidars, in the middle of a square room, on a robot that turns at 1 rad/s in either direction.
 
-`step`: by how many steps of the scan the worst beam is out of place. `deskew_mm`: distance from a wall 3 m away of 19
-in 20 ends of beams that meet it head-on, each beam placed by its own time, worst scan of either sense of turning.
-`clock_ms`: greatest error of the stamps: the turn by which a whole scan is off, at 1 rad/s.
+`step`: displacement of the worst beam, in steps of the scan. `deskew_mm`: 95th percentile of the distance between a
+wall 3 m away and the ends of beams that meet it perpendicularly, each beam placed by its own time; worst scan of either
+direction of turn. `clock_ms`: maximum error of the stamps, from the yaw error of a whole scan at 1 rad/s.
 """
 
 import math
@@ -46,7 +46,7 @@ HOLE = 0.006
 
 
 def to_wall(ways: Array) -> Array:
-    """Range from the middle of the room in directions (n,), m."""
+    """Return the range from the middle of the room in directions (n,), m."""
     return np.asarray(WALL / np.maximum(np.abs(np.cos(ways)), np.abs(np.sin(ways))))
 
 
@@ -63,14 +63,14 @@ class Turning:
 
 
 def placed(scan: LaserScan, rate: float) -> tuple[Array, Array]:
-    """Directions, rad, and ranges, m, of its returns, each (n,), the robot's turn at each beam's time undone."""
+    """Return directions (rad) and ranges (m) of the returns, each (n,), with the robot's turn removed."""
     beams = np.flatnonzero(scan.codes == VALID_BEAM)
     times = scan.stamp + beams * scan.time_increment * SECOND
     return scan.start_angle + scan.angle_increment * beams + rate * times / SECOND, scan.ranges[beams]
 
 
 def step_error(scan: LaserScan, rate: float) -> float:
-    """By how many steps the worst beam is out of place."""
+    """Return the displacement of the worst beam in steps."""
     ways, ranges = placed(scan, rate)
     tried = [np.abs(to_wall(ways + steps * scan.angle_increment) - ranges) < HOLE for steps in STEPS]
     off = np.where(np.array(tried), np.abs(STEPS)[:, None], math.inf).min(axis=0)
@@ -78,7 +78,7 @@ def step_error(scan: LaserScan, rate: float) -> float:
 
 
 def deskew_error(scan: LaserScan, rate: float) -> float:
-    """Millimetres by which 19 in 20 of the ends head-on lie beside the wall."""
+    """Return the 95th percentile of the distance (mm) of perpendicular beam ends from the wall."""
     ways, ranges = placed(scan, rate)
     bearing = np.remainder(ways + math.pi / 4, math.pi / 2) - math.pi / 4
     near = np.abs(bearing) < HEAD_ON
@@ -86,7 +86,7 @@ def deskew_error(scan: LaserScan, rate: float) -> float:
 
 
 def clock_error(scan: LaserScan, rate: float) -> float:
-    """Milliseconds by which the stamp is off."""
+    """Return the error of the stamp, ms."""
     ways, ranges = placed(scan, rate)
     misfit = [float(np.mean((to_wall(ways + turn) - ranges) ** 2)) for turn in TURNS]
     return abs(float(TURNS[int(np.argmin(misfit))])) * 1000
@@ -102,7 +102,7 @@ def measured(
     stalls: tuple[tuple[str, str], ...] = TURNING_HEAD,
     mute: str = "silent on",
 ) -> dict[str, Any]:
-    """The row of a lidar; ``make`` takes the clock and the robot's turn rate."""
+    """Measure a lidar; ``make`` receives the clock and the robot's turn rate."""
     found: dict[str, list[float]] = {"step": [], "deskew_mm": [], "clock_ms": []}
     for rate in (1.0, -1.0):
 

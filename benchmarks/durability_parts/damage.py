@@ -1,4 +1,4 @@
-"""Damaged logs: every message whose chunk is whole survives ``recover``, and the original stays as it is."""
+"""Damaged logs: every message in an intact chunk survives ``recover``, and the original file is unchanged."""
 
 import random
 import shutil
@@ -31,7 +31,7 @@ Row = tuple[str, int, bytes]
 
 
 class Made(NamedTuple):
-    """A log and what is in it."""
+    """A log and its content."""
 
     data: bytes
     chunks: list[tuple[bytes, list[Row]]]
@@ -39,7 +39,7 @@ class Made(NamedTuple):
 
 
 def frames(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Opcode, begin and end of every record of a sound log."""
+    """Yield opcode, start and end of every record of an intact log."""
     at = len(MAGIC)
     while at + 9 <= len(data):
         length = int.from_bytes(data[at + 1 : at + 9], "little")
@@ -48,7 +48,7 @@ def frames(data: bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def made(folder: Path, compression: Compression, *, finished: bool) -> Made:
-    """A log of eight chunks."""
+    """Write a log of eight chunks."""
     file = folder / f"{compression}-{finished}.mcap"
     log = LogFile(file, compression, 1 << 20, {"config": {"a": 1}}, {"robot": "truck"}, SECOND)
     rng = random.Random(1)
@@ -79,14 +79,14 @@ def made(folder: Path, compression: Compression, *, finished: bool) -> Made:
 
 
 def read(file: Path) -> list[Row]:
-    """All messages, by the stock reader."""
+    """Read all messages with the official reader."""
     with file.open("rb") as stream:
         found = make_reader(stream, validate_crcs=True).iter_messages(log_time_order=False)
         return [(channel.topic, message.log_time, message.data) for _, channel, message in found]
 
 
 def damaged(data: bytes, rng: random.Random) -> bytes:
-    """One to three holes, flips, cuts, blocks twice, blocks over others, noise or blocks gone."""
+    """Return the data with one to three faults: holes, flips, cuts, repeated, overwritten or missing blocks, noise."""
     for _ in range(rng.randint(1, 3)):
         begin, end = sorted((rng.randint(0, len(data)), rng.randint(0, len(data))))
         if rng.random() < 0.5:
@@ -111,7 +111,7 @@ def damaged(data: bytes, rng: random.Random) -> bytes:
 
 
 def wrong(log: Made, broken: bytes, file: Path, fixed: Path) -> str | None:
-    """What is wrong with the repair of ``file``, which holds ``broken``, to ``fixed``; None if nothing is."""
+    """Return a fault in the repair of ``file``, which contains ``broken``, to ``fixed``; None if it is right."""
     whole = [row for chunk, rows in log.chunks if chunk in broken for row in rows]
     try:
         done = recover(file, fixed)
@@ -139,7 +139,7 @@ def wrong(log: Made, broken: bytes, file: Path, fixed: Path) -> str | None:
 
 
 def run(count: int, seed: int, work: Path) -> dict[str, Any]:
-    """Damage and repair ``count`` logs; figures."""
+    """Damage and repair ``count`` logs; return the figures."""
     work.mkdir(parents=True)
     logs = [made(work, kind, finished=done) for kind in Compression for done in (True, False)]
     rng, faults, kept, lost = random.Random(seed), 0, 0, 0

@@ -1,4 +1,4 @@
-"""Kills and power cuts: run a subject's writer, end it anywhere, and check what is left."""
+"""Kills and power cuts: run a subject's writer, end it at any point, and check what remains."""
 
 import os
 import random
@@ -24,7 +24,7 @@ TRACES: Final = 8
 
 
 def kills(subjects: Sequence[Subject], count: int, seed: int, work: Path) -> dict[str, Any]:
-    """Kill writers ``count`` times, subject by subject in turn; figures by subject.
+    """Kill writers ``count`` times, subject by subject in turn; return figures by subject.
 
     A writer is a fork of this process, which must have no other thread.
     """
@@ -41,7 +41,7 @@ def kills(subjects: Sequence[Subject], count: int, seed: int, work: Path) -> dic
 
 
 def _killed(subject: Subject, folder: Path, seed: int, seconds: float) -> list[str]:
-    """Let a writer work for a while and kill it; its acknowledgments."""
+    """Let a writer work for a while and kill it; return its acknowledgements."""
     begun, begin = os.pipe()
     child = os.fork()
     if child == 0:
@@ -64,14 +64,14 @@ def _killed(subject: Subject, folder: Path, seed: int, seconds: float) -> list[s
 
 
 def work(subject: Subject, folder: Path, seed: int, begin: int | None = None, most: int | None = None) -> None:
-    """Be a subject's writer.
+    """Run a subject's writer.
 
     Args:
-        subject: which.
-        folder: where.
-        seed: of the changes.
-        begin: descriptor that gets a byte before the first change.
-        most: acknowledged changes; None = until it is killed, or has no more.
+        subject: subject to write.
+        folder: output folder.
+        seed: seed of the changes.
+        begin: descriptor that receives a byte before the first change.
+        most: number of acknowledged changes; None: until it is killed, or has no more.
     """
     notes = os.open(folder / ACKNOWLEDGED, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     if begin is not None:
@@ -83,7 +83,7 @@ def work(subject: Subject, folder: Path, seed: int, begin: int | None = None, mo
 
 
 def cuts(subjects: Sequence[Subject], count: int, seed: int, work: Path) -> dict[str, Any]:
-    """Cut the power ``count`` times, subject by subject in turn; figures by subject.
+    """Cut the power ``count`` times, subject by subject in turn; return figures by subject.
 
     Raises:
         FileNotFoundError: there is no C compiler.
@@ -120,7 +120,7 @@ def _cut(subject: Subject, library: Path, work: Path, rng: random.Random, count:
 
 
 def _lines(data: bytes) -> list[str]:
-    """Complete lines."""
+    """Return the complete lines."""
     return [line.decode() for line in data.split(b"\n")[:-1]]
 
 

@@ -1,9 +1,9 @@
-"""A disk whose power is cut: from a trace of writes, names and syncs, what may be left.
+"""A disk after a power cut: possible remaining content, from a trace of writes, names and syncs.
 
-``trace.c`` is compiled to a library that records what a process does below one folder. ``Disk`` plays such a trace up
-to any point. What was synced then is there. The rest is there in part: of the changes of names a first part (a journal
-keeps their order; syncing a folder keeps all until then), of each file's writes a first part, pages of the last of
-which may hold zeros, as a file has its new length before its data.
+``trace.c`` is compiled to a library that records the changes of a process below one folder. ``Disk`` replays such a
+trace up to any point. Synced data remains. Of the rest a part remains: of the changes of names a first part (a journal
+keeps their order; syncing a folder keeps all until then), and of each file's writes a first part, whose last pages may
+contain zeros, because a file gets its new length before its data.
 """
 
 import os
@@ -23,7 +23,7 @@ _HEAD: Final = struct.Struct("<BQQII")
 
 
 class Event(NamedTuple):
-    """One thing that a process did."""
+    """One recorded operation of the process."""
 
     kind: str
     inode: int
@@ -47,7 +47,7 @@ def compiled(folder: Path) -> Path:
 
 
 def traced(library: Path, root: Path, trace: Path) -> dict[str, str]:
-    """Environment of a process whose changes below ``root`` are appended to ``trace``."""
+    """Return the environment of a process whose changes below ``root`` are appended to ``trace``."""
     return os.environ | {
         "LD_PRELOAD": str(library),
         "DURABILITY_ROOT": str(root.resolve()),
@@ -56,7 +56,7 @@ def traced(library: Path, root: Path, trace: Path) -> dict[str, str]:
 
 
 def events(trace: bytes) -> Iterator[Event]:
-    """Events of a trace; one that is cut is left out."""
+    """Yield the events of a trace; a truncated one is left out."""
     at = 0
     while at + _HEAD.size <= len(trace):
         kind, inode, offset, first, second = _HEAD.unpack_from(trace, at)
@@ -69,13 +69,13 @@ def events(trace: bytes) -> Iterator[Event]:
 
 @dataclass(eq=False)
 class _File:
-    """A file: what is on the disk, and what was written since."""
+    """A file: its content on the disk, and the writes since."""
 
     synced: bytes = b""
     pending: list[Event] = field(default_factory=list)
 
     def after(self, count: int) -> bytes:
-        """Content with the first ``count`` pending writes."""
+        """Return the content with the first ``count`` pending writes."""
         data = bytearray(self.synced)
         for event in self.pending[:count]:
             if event.kind == "T":
@@ -90,7 +90,7 @@ class _File:
         self.synced, self.pending = self.after(len(self.pending)), []
 
     def left(self, rng: random.Random) -> bytes:
-        """What a power cut leaves."""
+        """Return a possible content after a power cut."""
         count = rng.randint(0, len(self.pending))
         data = bytearray(self.after(count))
         if count and (last := self.pending[count - 1]).kind == "W" and rng.random() < 0.5:
@@ -102,10 +102,10 @@ class _File:
 
 
 class Names(dict[str, "_File | bytes | None"]):
-    """What each path names: a file, the target of a link, or a folder (None)."""
+    """Target of each path: a file, the target of a link, or a folder (None)."""
 
     def apply(self, event: tuple[str, str, str, "_File | bytes | None"]) -> None:
-        """Change names as ``event`` says: kind, two paths, and what a new name names."""
+        """Apply a change of names: kind, two paths, and the target of a new name."""
         kind, first, second, what = event
         match kind:
             case "O" | "M" | "Y":
@@ -133,10 +133,10 @@ class Names(dict[str, "_File | bytes | None"]):
 
 
 class Disk:
-    """Plays a trace.
+    """Replays a trace.
 
     Args:
-        root: the folder that was traced.
+        root: traced folder.
     """
 
     def __init__(self, root: Path) -> None:
@@ -150,7 +150,7 @@ class Disk:
         self.acknowledged = b""
 
     def play(self, event: Event) -> None:
-        """Note what happened."""
+        """Apply an event."""
         first, second = event.first.decode(), event.second.decode() if event.kind in "RLEY" else ""
         match event.kind:
             case "O":
@@ -190,7 +190,7 @@ class Disk:
         self._pending.append(change)
 
     def leave(self, folder: Path, rng: random.Random) -> None:
-        """Write into ``folder`` what a power cut now may leave."""
+        """Write into ``folder`` a possible content after a power cut now."""
         names = Names(self._synced)
         for change in self._pending[: rng.randint(0, len(self._pending))]:
             names.apply(change)

@@ -1,12 +1,13 @@
-"""Files that users hand in, mutated: each is read or refused, within 5 s and 500 MB, without a traceback of a library.
+"""Mutated user files: each is read or refused, within 5 s and 500 MB, without a library's traceback.
 
-``kinds.py`` has the kinds. Mutations know no format (flips, holes, cuts, blocks twice, noise) or a little of it, so
-that some pass the first checks: numbers and words are replaced; archives, packed files and logs are changed inside and
-packed again, with sound checksums. A file depends on its number and the seed alone: any part of a run can be repeated.
+``kinds.py`` defines the kinds. Some mutations know no format (flips, holes, cuts, repeated blocks, noise), others know
+a little of it, so that they pass the first checks: numbers and words are replaced; archives, packed files and logs are
+changed inside and packed again, with valid checksums. A file depends only on its number and the seed: any part of a run
+can be repeated.
 
-The time of a file is what it takes on a computer that does nothing else: the larger of the processor time of the
-process and the elapsed time without that for which its main thread waited for a processor, as the kernel counts it.
-Its memory is what reading adds to that of a command: this process has the libraries of all commands.
+The time of a file is its time on an idle computer: the larger of the processor time of the process, and the elapsed
+time minus the time for which its main thread waited for a processor, as counted by the kernel. Its memory is what
+reading adds to that of a command: this process has loaded the libraries of all commands.
 """
 
 import faulthandler
@@ -105,7 +106,7 @@ PACKINGS: Final[dict[bytes, Callable[[bytes, random.Random], bytes]]] = {
 
 
 def mutated(data: bytes, rng: random.Random) -> bytes:
-    """One to three changes."""
+    """Apply one to three changes."""
     for _ in range(rng.randint(1, 3)):
         if not data:
             return data
@@ -133,7 +134,7 @@ def mutated(data: bytes, rng: random.Random) -> bytes:
 
 
 def _reworded(data: bytes, rng: random.Random) -> bytes:
-    """A number or word replaced."""
+    """Replace a number or word."""
     words = list(re.finditer(rb"-?[\w.]+", data[:20_000]))
     if not words:
         return data
@@ -146,17 +147,17 @@ def _reworded(data: bytes, rng: random.Random) -> bytes:
 
 
 def peak() -> float:
-    """Greatest memory of this process since it was last reset (MB)."""
+    """Return the peak memory of this process since the last reset (MB)."""
     return int(Path("/proc/self/status").read_text(encoding="ascii").split("VmHWM:")[1].split()[0]) / 1000
 
 
 def reset_peak() -> None:
-    """Restart ``peak``."""
+    """Reset ``peak``."""
     Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 
 
 class Spent(NamedTuple):
-    """Times at a moment (s)."""
+    """Times at an instant (s)."""
 
     elapsed: float
     processor: float
@@ -171,13 +172,13 @@ class Spent(NamedTuple):
         return cls(time.perf_counter(), sum(os.times()[:4]), waited / SECOND)
 
     def since(self, begin: "Spent") -> float:
-        """Time that the same would have taken on a computer without other work (s)."""
+        """Return the time that the same work would take on an idle computer (s)."""
         elapsed = self.elapsed - begin.elapsed - (self.waited - begin.waited)
         return max(elapsed, self.processor - begin.processor)
 
 
 def run(first: int, count: int, seed: int, work: Path) -> dict[str, Any]:
-    """Mutate and read files number ``first`` and on; figures by kind."""
+    """Mutate and read files from number ``first`` on; return figures by kind."""
     known = kinds()
     figures = {
         name: {"files": 0, "read": 0, "faults": 0, "seconds": 0.0, "slowest": first, "megabytes": 0.0} for name in known
@@ -220,7 +221,7 @@ def run(first: int, count: int, seed: int, work: Path) -> dict[str, Any]:
 
 
 def _made(kind: Kind, folder: Path) -> dict[str, bytes]:
-    """Sound files of a kind by place in ``folder``, which is empty before and after; they have been read once."""
+    """Return intact files of a kind by place in ``folder``, which is empty before and after; they have been read once."""
     kind.make(folder)
     files = (file for file in folder.rglob("*") if file.is_file() and not file.is_symlink())
     sound = {str(file.relative_to(folder)): file.read_bytes() for file in files}
@@ -231,7 +232,7 @@ def _made(kind: Kind, folder: Path) -> dict[str, bytes]:
 
 
 def _try(kind: Kind, folder: Path) -> tuple[str | None, float, float]:
-    """What a library raised ("" = a refusal of ours, None = it was read), seconds, and greatest memory (MB)."""
+    """Return a library's exception ("": ours, None: it was read), seconds, peak memory (MB)."""
     reset_peak()
     loaded, begin, fault = peak(), Spent.now(), None
     try:
@@ -246,7 +247,7 @@ def _try(kind: Kind, folder: Path) -> tuple[str | None, float, float]:
 
 
 def run_apart(count: int, seed: int, work: Path, first: int = 0) -> dict[str, Any]:
-    """``run`` in a process of its own: one that a library kills is a fault as well."""
+    """Run in a separate process: a crash of the process by a library is a fault as well."""
     command = [sys.executable, "-m", "benchmarks.durability_parts.files", *map(str, (first, count, seed, work))]
     done = subprocess.run(command, stdout=subprocess.PIPE, check=False)
     shutil.rmtree(work, ignore_errors=True)

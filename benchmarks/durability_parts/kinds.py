@@ -1,6 +1,6 @@
-"""Kinds of files that users hand in, or that the daemon finds: sound ones, and the functions that read them.
+"""Kinds of files supplied by users or found by the daemon: intact ones, and the functions that read them.
 
-Where a command does more than call one function, its own function is called, with its output thrown away.
+If a command does more than call one function, its own function is called, with its output discarded.
 """
 
 import asyncio
@@ -111,9 +111,9 @@ class Kind(NamedTuple):
     """Files of one kind.
 
     Args:
-        make: writes sound ones into an empty folder; the mutated ones are among them.
-        read: reads the folder as a command or the daemon does.
-        share: how often it is tried, in relation to others; those that take long are tried less often.
+        make: writes intact ones into an empty folder; the mutated ones are among them.
+        read: reads the folder like a command or the daemon.
+        share: relative frequency; slow kinds are tried less often.
     """
 
     make: Callable[[Path], object]
@@ -122,7 +122,7 @@ class Kind(NamedTuple):
 
 
 def kinds() -> dict[str, Kind]:
-    """By name."""
+    """Return all kinds by name."""
     return {
         "map": Kind(_map, lambda it: surface_elements(load_map(it / "m.yaml"))),
         "map16": Kind(_map16, lambda it: load_map(it / "m.yaml")),
@@ -186,15 +186,15 @@ def kinds() -> dict[str, Kind]:
 
 
 def command(*words: str | Path, allowed: Reason = Reason.OK) -> None:
-    """Run a command line, with its output thrown away.
+    """Run a command line, with its output discarded.
 
     Args:
-        words: of the command line.
-        allowed: reason with which it may end as well.
+        words: words of the command line.
+        allowed: permitted reason of its end, besides ``OK``.
 
     Raises:
-        TruckError: its exit code is another one.
-        Exception: whatever it does not turn into an exit code.
+        TruckError: its exit code is different.
+        Exception: any exception that it does not convert to an exit code.
     """
     done = CliRunner().invoke(app, [str(word) for word in words])
     if done.exception is not None and not isinstance(done.exception, SystemExit):
@@ -252,7 +252,7 @@ def _read_log(folder: Path) -> None:
 
 
 def _run(folder: Path) -> None:
-    """First second of a drive, with all topics."""
+    """Record the first second of a drive, with all topics."""
     export_mcap(max(DATA.glob("golden/*/run.mcap")), folder / "log.mcap", Selection(end=RUN))
 
 
@@ -264,7 +264,7 @@ def _read_run(folder: Path) -> None:
 
 
 def as_a_command(log: Path) -> AbstractContextManager[object]:
-    """Context in which every command on logs reads one."""
+    """Context in which every command on logs reads this one."""
     return cli_logs.reading_log("read", log)
 
 
@@ -288,7 +288,7 @@ def _read_animated(folder: Path) -> None:
 
 
 def _exported(export: Callable[[Path], object]) -> Callable[[Path], None]:
-    """Return what exports the log of a folder as the command does."""
+    """Return a function that exports the log of a folder like the command."""
 
     def read(folder: Path) -> None:
         with as_a_command(folder / "log.mcap"):
@@ -448,7 +448,7 @@ def _odometer(folder: Path) -> None:
 
 
 def _read_checked(folder: Path) -> None:
-    """Compute a log again, of which most is cut off: it differs."""
+    """Replay a truncated log: it differs."""
     command("replay", "--check", folder / "log.mcap", allowed=Reason.REPLAY_DIFFERS)
 
 
@@ -468,7 +468,7 @@ def _read_localised(folder: Path) -> None:
 
 
 def _study(folder: Path) -> None:
-    """Fifteen seconds on a circle under a stand, with odometry."""
+    """Record fifteen seconds on a circle under a stand, with odometry."""
     config = load_truck(CONFIGS / "truck.yaml")[0].model_dump(mode="json")
     log = LogFile(folder / "log.mcap", Compression.LZ4, 1 << 16, {"config": config}, {}, SECOND)
     for seq in range(150):
@@ -500,7 +500,7 @@ def _read_study(folder: Path) -> None:
 
 
 def _folder(folder: Path) -> None:
-    """A finished log, and one of a killed daemon."""
+    """Write a finished log, and one of a killed daemon."""
     for finished in (True, False):
         made(folder, Compression.ZSTD, finished=finished)
 

@@ -24,9 +24,9 @@ Part = tuple[str, int, int]
 
 
 def write(folder: Path, seed: int) -> Iterator[str]:
-    """Map, run after run; every part holds the numbers of its run and its save.
+    """Save maps run after run; every part contains the numbers of its run and its save.
 
-    Points that come before the grid of their run are acknowledged once the grid is saved as well.
+    Points saved before the grid of their run are acknowledged once the grid is saved as well.
     """
     rng, place, number, mapped = random.Random(seed), folder / "map", 0, -1
     while True:
@@ -44,7 +44,7 @@ def write(folder: Path, seed: int) -> Iterator[str]:
 
 
 def check(folder: Path, acknowledged: list[str], death: Death) -> str | None:
-    """Load as the next start does: all parts are of one run, each as new as it was acknowledged."""
+    """Load as at the next start: all parts must be of one run, each at least as new as acknowledged."""
     place, parts = folder / "map", [_part(line) for line in acknowledged]
     tidy(place)
     if left := [path.name for path in place.glob("saves/*") if not path.name.isdecimal()]:

@@ -1,4 +1,4 @@
-"""Recordings: what the recorder has written before a death is there after the repair of the next start."""
+"""Recordings: data written before the death of the recorder survives the repair at the next start."""
 
 import random
 from collections.abc import Iterator
@@ -27,12 +27,12 @@ KEPT_AFTER: Final = {Death.KILL: 1.5 * CHUNK, Death.CUT: 1.5 * CHUNK + SYNC}
 
 
 def payload(number: int) -> bytes:
-    """Content of a message: some of it does not compress."""
+    """Return the content of a message, partly incompressible."""
     return b'{"number": %d, "noise": "%s"}' % (number, random.Random(number).randbytes(number % 300).hex().encode())
 
 
 def write(folder: Path, seed: int) -> Iterator[str]:
-    """Record; yields how many messages were given to the writer."""
+    """Record; yield the number of messages passed to the writer."""
     rng = random.Random(seed)
     config = RecorderConfig(
         directory=str(folder / "logs"),
@@ -53,7 +53,7 @@ def write(folder: Path, seed: int) -> Iterator[str]:
 
 
 def check(folder: Path, acknowledged: list[str], death: Death) -> str | None:
-    """Repair as the next start does, and look for every message that is old enough."""
+    """Repair as at the next start, and look for every message that is old enough."""
     logs = folder / "logs"
     if not logs.is_dir():
         return "no folder of logs" if acknowledged else None

@@ -30,19 +30,19 @@ KEYS: Final = ("gate.limits.speed", "gate.limits.acceleration", "tracker.lookahe
 
 
 def _numbered(acknowledged: list[str]) -> int:
-    """Number of the newest acknowledged change; 0 before the first."""
+    """Return the number of the latest acknowledged change; 0 before the first."""
     return int(acknowledged[-1]) if acknowledged else 0
 
 
 def _tidy(folder: Path) -> str | None:
-    """Remove leftovers as a start does; says what stays."""
+    """Remove leftovers as at a start; describe any that remain."""
     remove_leftovers(folder)
     left = [path.name for path in folder.glob(f"*{SCRATCH}")]
     return f"left behind: {left}" if left else None
 
 
 def _one_of(found: int, acknowledged: list[str]) -> str | None:
-    """Whether a number is the acknowledged one, or that of the change under way."""
+    """Whether a number is the acknowledged one, or that of the change in progress."""
     newest = _numbered(acknowledged)
     return None if found in (newest, newest + 1) else f"{found}, acknowledged {newest}"
 
@@ -77,7 +77,7 @@ def _check_settings(folder: Path, acknowledged: list[str], _: Death) -> str | No
 
 
 def missions(file: Path) -> MissionService:
-    """The service with what it needs to keep a mission in ``file``."""
+    """Return the service with the parts it needs to keep a mission in ``file``."""
     nothing: Any = SimpleNamespace(latest=None)
     inputs: Any = SimpleNamespace(**dict.fromkeys((field.name for field in fields(MissionInputs)), nothing))
 
@@ -206,7 +206,7 @@ def _check_odometer(folder: Path, acknowledged: list[str], _: Death) -> str | No
 
 
 def _write_latch(folder: Path, seed: int) -> Iterator[str]:
-    """Every other change is the same again: what it must be is known then, whether it came to its end or not."""
+    """Write the latch; every other change repeats the last one, so its result is known even if unfinished."""
     latch, rng = EstopLatch(folder / "state" / "estop", folder), random.Random(seed)
     latch.prepare()
     engaged = False

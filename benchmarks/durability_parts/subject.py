@@ -1,16 +1,16 @@
-"""What a subject of kills and power cuts is.
+"""Subjects of kills and power cuts.
 
 To add one, write a module with two functions and a ``SUBJECT``:
 
-``write(folder, seed)`` is a generator that runs in a process of its own, in an empty folder, with the project's own
-code for saving (the function that the daemon calls, not a copy of it). It makes one change after the other and yields
-a line of text each time one is acknowledged, e.g. ``"setting gate.speed 0.4"``; it need not end. The line is on record
-before the next change begins. Nothing outside of ``folder`` is written.
+``write(folder, seed)`` is a generator that runs in a separate process, in an empty folder, with the project's own code
+for saving (the function that the daemon calls, not a copy of it). It makes one change after the other and yields a line
+of text when each is acknowledged, e.g. ``"setting gate.speed 0.4"``; it need not end. The line is recorded before the
+next change begins. Nothing outside of ``folder`` is written.
 
-``check(folder, acknowledged, death)`` gets what is left and the lines that were acknowledged, and reads it with the
-project's own code, as the next start does (it may repair; the folder is thrown away afterwards). It returns None, or
-what is wrong: an acknowledged change is lost, two saves are mixed, a file cannot be read. The last change, made but
-not acknowledged, may be there or not. An exception is a fault as well.
+``check(folder, acknowledged, death)`` receives the remaining content and the acknowledged lines, and reads the content
+with the project's own code, as the next start does (it may repair; the folder is discarded afterwards). It returns
+None, or the fault: an acknowledged change is lost, two saves are mixed, a file cannot be read. The last change, made
+but not acknowledged, may be present or not. An exception is a fault as well.
 """
 
 from collections.abc import Callable, Iterator
@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 
 class Death(StrEnum):
-    """How the writer ended."""
+    """End of the writer."""
 
     KILL = "kill"
     """The process alone: the kernel has all that was written."""
@@ -29,7 +29,7 @@ class Death(StrEnum):
 
 
 class Subject(NamedTuple):
-    """Something that is written and acknowledged."""
+    """Data that is written and acknowledged."""
 
     name: str
     write: Callable[[Path, int], Iterator[str]]

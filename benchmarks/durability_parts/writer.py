@@ -1,4 +1,4 @@
-"""A subject's writer as a process of its own, whose changes are traced: SUBJECT FOLDER SEED CHANGES."""
+"""A subject's writer as a separate process whose changes are traced: SUBJECT FOLDER SEED CHANGES."""
 
 import sys
 from pathlib import Path

@@ -65,7 +65,7 @@ class StandstillMonitor:
         return "; ".join(dict.fromkeys(said))
 
     def _after_it_began(self, stop: Stop) -> bool:
-        """Whether the stop ended the latest drive; in front of an obstacle the robot stands, but its driver keeps control."""
+        """Whether the stop ended the latest drive; at an obstacle the robot stands, but its driver keeps control."""
         return self._since is not None and stop.stamp >= self._since and not stop.mode.accepts_motion
 
     def _take(self) -> None:
