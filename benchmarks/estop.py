@@ -1,25 +1,25 @@
-"""How long from an emergency stop to the quick-stop bytes on the drive controller's wire, whatever else arrives.
+"""Time from an emergency stop to the quick-stop bytes on the drive controller's wire, under floods of other messages.
 
     python benchmarks/estop.py [--trials 300] [--quick] [--flood NAME ...]
     python benchmarks/estop.py --cost [--flood NAME ...]
     python benchmarks/estop.py --page [--trials 500] [--quick]
 
-Emulated truck, its daemon in a process of its own, pinned to one core; world, emulators, the operator and the flooder
-on the other. The truck drives to and fro at 0.1 m/s; each trial sends one emergency stop by topic and counts from then
-to the first quick stop on the wire. One that is not on the wire within ``MISSED`` s is missed. Floods, as fast as the
-flooder can, at most ``RATE`` a second; the rate that it achieved is reported, and how busy others kept the cores:
+The daemon of the emulated truck runs in a separate process, pinned to one core; world, emulators, operator and flooder
+share the other. The truck drives to and fro at 0.1 m/s. Each trial sends one emergency stop by topic and measures the
+time to the first quick stop on the wire; without one within ``MISSED`` s the stop is missed. Floods are as fast as the
+flooder can send, at most ``RATE`` a second; the achieved rate and the load of the cores by other programs are reported:
 
     none     nothing else
     nonce    orders to arm with another run's nonce
-    orders   orders with the right nonce and growing sequence, of a role that may not give them
-    stops    orders to stop, which are taken from everybody: the truck stands, armed, when the emergency stop comes
+    orders   orders with the right nonce and growing sequence numbers, of a role without the permission
+    stops    orders to stop, which every role may send: the truck stands, armed, when the emergency stop arrives
     rubbish  bytes that are no order
     calls    remote calls, each with an answer
-    forged   states of the gate and scans that the flooder publishes under the robot's keys, the robot with
-             ``zenoh.access_control``: without it they reach the operator, who takes the truck for disarmed
+    forged   states of the gate and scans published under the robot's keys, by a robot with
+             ``zenoh.access_control``: without it they reach the operator's program, which then sees a disarmed truck
 
-``--cost`` prints the daemon's processor time for each message of a flood instead: that of a daemon whose truck stands,
-less what it takes without a flood. It does not depend on who else is at work.
+``--cost`` prints the daemon's processor time for each message of a flood instead: that of a daemon with a standing
+truck, minus its time without a flood. It does not depend on other load.
 
 ``--quick`` makes 40 trials of none, nonce and rubbish. ``--page`` measures from the page in a browser instead
 (``estop_parts/page.py``): clicks, commands to the wires, and a frozen browser. The last line is JSON.
@@ -90,7 +90,7 @@ QUIET = 0.03
 
 
 class TappedPort(PtyPort):
-    """Prints when a quick stop reached the drive controller, ns."""
+    """Prints the time (ns) when a quick stop reached the drive controller."""
 
     def __init__(self, link: Path) -> None:
         super().__init__(link)
@@ -110,7 +110,7 @@ class TappedPort(PtyPort):
 
 
 def serve(config: Path) -> None:
-    """``monstertruckd simulate`` with a tap on the drive's wire."""
+    """Run ``monstertruckd simulate`` with a tap on the drive's wire."""
     simulate.PtyPort = TappedPort  # type: ignore[attr-defined, misc]
     run_wall(lambda clock: simulate.serve(clock, (load_simulated(config),), on_stderr))
 
@@ -121,13 +121,13 @@ def serve(config: Path) -> None:
 def flood(kind: str, endpoint: str, nonce: str, yields: bool) -> None:
     """Flood from the first line of standard input to the next one, and so on until it ends.
 
-    Prints a line when it is connected; at the end how many messages were sent, and in how many seconds.
+    Prints a line when it is connected; at the end the number of sent messages and the seconds they took.
 
     Args:
-        kind: which flood.
-        endpoint: of the robot.
-        nonce: of its run.
-        yields: to the emulated devices and the operator that share its core: real ones have processors of their own.
+        kind: name of the flood.
+        endpoint: endpoint of the robot.
+        nonce: nonce of its run.
+        yields: whether to yield to emulated devices and operator on its core: real devices have their own processors.
     """
     import select  # noqa: PLC0415 - of this process only
 
@@ -161,7 +161,7 @@ def flood(kind: str, endpoint: str, nonce: str, yields: bool) -> None:
 
 
 def _sender(session: Any, kind: str, nonce: str) -> Callable[[int], None]:
-    """Sends the message of a flood that has the number given."""
+    """Return a function that sends the message of a flood with the given number."""
     rng = np.random.default_rng(1)
     order = {"source": "flood", "role": "station", "lease": 1.0, "nonce": "another", "order": "arm"}
     if kind == "orders":
@@ -192,7 +192,7 @@ def _sender(session: Any, kind: str, nonce: str) -> Callable[[int], None]:
 
 
 class Flooder:
-    """A flood in a process of its own.
+    """A flood in a separate process.
 
     Args:
         running: that process.
@@ -202,18 +202,18 @@ class Flooder:
         self._running = running
 
     async def switch(self) -> None:
-        """Begin, or pause."""
+        """Start or pause."""
         assert self._running.stdin is not None
         self._hurry()
         self._running.stdin.write(b"\n")
         await self._running.stdin.drain()
 
     def _hurry(self) -> None:
-        """Have it read what it shall do: on a computer that others keep busy, one that yields gets no turn."""
+        """Raise its priority until it has read the command: a yielding process gets no time on a busy computer."""
         set_scheduler(self._running.pid, os.SCHED_OTHER)
 
     async def end(self) -> float:
-        """End; returns how many were sent a second while it flooded."""
+        """End the flood; return its messages per second of flooding."""
         self._hurry()
         printed, _ = await self._running.communicate(b"")
         sent = json.loads(printed.splitlines()[-1])
@@ -224,7 +224,7 @@ class Flooder:
 async def flooder(
     kind: str, client: TruckClient, endpoint: str, folder: Path, core: int | None
 ) -> AsyncIterator[Flooder]:
-    """A connected flooder that does not flood yet; without a core of its own it yields to nobody."""
+    """Start a connected flooder that does not flood yet; without a separate core it does not yield."""
     state = await client.get_retained(topics.GATE)
     assert state is not None
     words = (
@@ -245,7 +245,7 @@ async def flooder(
 
 
 class Stops:
-    """Instants of quick stops on the wire, as the simulator prints them."""
+    """Times of quick stops on the wire, as printed by the simulator."""
 
     def __init__(self, stream: asyncio.StreamReader) -> None:
         self._stream = stream
@@ -258,7 +258,7 @@ class Stops:
                 self._instants.put_nowait(int(line[5:]))
 
     async def first_after(self, instant: int) -> int | None:
-        """The first one after ``instant``, ns; None if it is missed."""
+        """Return the first one after ``instant``, ns; None if it is missed."""
         with suppress(TimeoutError):
             async with asyncio.timeout(MISSED):
                 while (at := await self._instants.get()) < instant:
@@ -270,10 +270,10 @@ class Stops:
 async def press(
     client: TruckClient, stops: Stops, forward: bool, more: float, stopping: Flooder | None = None
 ) -> float | None:
-    """Drive, then one emergency stop; seconds to its quick stop, None if it is missed. Leaves the truck disarmed.
+    """Drive, then send one emergency stop; return the seconds to its quick stop, None if missed.
 
-    A truck that a computer too busy for its sensors has disarmed meanwhile is armed again. With a flood of stops it
-    stands when the emergency stop comes.
+    The truck is disarmed at the end. A truck that was disarmed because a busy computer delayed its sensors is armed
+    again. In a flood of stops the truck stands when the emergency stop arrives.
 
     Raises:
         TruckError, TimeoutError: the computer is too busy for the truck to drive.
@@ -306,7 +306,7 @@ async def press(
 
 
 async def trials(clock: Clock, folder: Path, kind: str, count: int) -> dict[str, Any]:
-    """All trials of one flood."""
+    """Run all trials of one flood."""
     endpoint = free_endpoint()
     base, access = folder / "to_and_fro.yaml", {"zenoh": {"access_control": True}} if kind == "forged" else {}
     demo = {"include": str(ROOT / "configs" / "demo.yaml"), "version": FILE_VERSION}
@@ -362,7 +362,7 @@ async def trials(clock: Clock, folder: Path, kind: str, count: int) -> dict[str,
 
 
 async def costs(clock: Clock, folder: Path, kinds: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Processor time of the daemon for each message of the floods, us, and how many came a second."""
+    """Return the daemon's processor time for each message of the floods (us), and the messages per second."""
     endpoint = free_endpoint()
     config = write_overlay(ROOT / "configs" / "demo.yaml", folder, endpoint)
     here = str(Path(__file__).resolve())
@@ -396,7 +396,7 @@ async def costs(clock: Clock, folder: Path, kinds: Sequence[str]) -> dict[str, d
 
 
 def print_costs(kinds: Sequence[str]) -> int:
-    """Print what each message of a flood costs; 0 = the goal is met."""
+    """Print the cost of each message of a flood; 0: the goal is met."""
     with TemporaryDirectory(prefix="estop-") as folder:
         figures = run_wall(lambda clock: costs(clock, Path(folder), kinds))
     print("| flood | rate, 1/s | processor time of the daemon for each, us |")
@@ -409,7 +409,7 @@ def print_costs(kinds: Sequence[str]) -> int:
 
 
 def from_the_page(count: int) -> int:
-    """Press on the page; 0 = all goals met."""
+    """Press the button on the page; 0: all goals are met."""
     from benchmarks.estop_parts import page  # noqa: PLC0415 - needs a browser
 
     with TemporaryDirectory(prefix="estop-") as folder:
@@ -424,7 +424,7 @@ def from_the_page(count: int) -> int:
 
 
 def main() -> int:
-    """Press; 0 = all goals met."""
+    """Run all trials; 0: all goals are met."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--trials", type=int, help="300; 500 from the page")
     parser.add_argument("--page", action="store_true", help="from a hand on the page, in a browser")

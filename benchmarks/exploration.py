@@ -79,11 +79,11 @@ def main() -> int:
 
 
 class Rows:
-    """Result rows of a part, each written at once.
+    """Result rows of a part, each written immediately.
 
     Args:
         part: name of the file.
-        keep: those of a run before count.
+        keep: whether to keep the rows of an earlier run.
     """
 
     def __init__(self, part: str, *, keep: bool) -> None:
@@ -95,11 +95,11 @@ class Rows:
             self._file.write_text("")
 
     def has(self, **key: Any) -> bool:
-        """Whether there is one like this."""
+        """Whether a row with these values exists."""
         return any(key.items() <= row.items() for row in self.all)
 
     def add(self, row: dict[str, Any]) -> None:
-        """Print it, and write it down."""
+        """Print and write a row."""
         self.all.append(row)
         print(json.dumps(row), flush=True)
         with self._file.open("a") as out:
@@ -107,7 +107,7 @@ class Rows:
 
 
 def metres(arguments: argparse.Namespace) -> tuple[dict[str, float], dict[str, float]]:
-    """All runs in the light harness."""
+    """Run all explorations in the light harness."""
     worlds = arguments.worlds or list(WORLDS if arguments.maps is not None else SHIPPED)
     rows = Rows("metres", keep=arguments.resume)
     warm_up()
@@ -122,7 +122,7 @@ def metres(arguments: argparse.Namespace) -> tuple[dict[str, float], dict[str, f
 
 
 def faulty(arguments: argparse.Namespace) -> tuple[dict[str, float], dict[str, float]]:
-    """The whole daemon, and what goes wrong."""
+    """Explore with the whole daemon and faults."""
     rows = Rows("faults", keep=arguments.resume)
     for seed in range(arguments.seeds or 20):
         for fault in arguments.faults:
@@ -132,7 +132,7 @@ def faulty(arguments: argparse.Namespace) -> tuple[dict[str, float], dict[str, f
 
 
 def whole(arguments: argparse.Namespace) -> tuple[dict[str, float], dict[str, float]]:
-    """The whole daemon."""
+    """Explore with the whole daemon."""
     rows = Rows("daemon", keep=arguments.resume)
     for seed in range(arguments.seeds or 2):
         for reach in arguments.reach:
@@ -150,14 +150,14 @@ def file_of(world: str, maps: Path | None) -> Path:
 
 
 def run_of(arena: Arena, kind: str, reach: float, seed: int) -> Run:
-    """One exploration."""
+    """Run one exploration."""
     if kind == "offline":
         return offline_tour(arena, reach, seed)
     return Rover(arena, EXPLORERS[kind].settings_class().model_validate({"reach": reach}), seed).explore()
 
 
 def row_of(run: Run) -> dict[str, Any]:
-    """What is kept of a run."""
+    """Return the saved values of a run."""
     return {
         "world": run.world, "kind": run.kind, "seed": run.seed, "reach": run.reach,
         "metres": {f"{share:.0%}": round(run.metres[share], 2) for share in SHARES if share in run.metres},
@@ -170,7 +170,7 @@ def row_of(run: Run) -> dict[str, Any]:
 
 
 def summary(rows: list[dict[str, Any]]) -> tuple[dict[str, float], dict[str, float]]:
-    """Means of each world, range and kind, with what they are to be below."""
+    """Return the means of each world, range and kind, with their goals."""
     figures: dict[str, float] = {}
     goals: dict[str, float] = {}
     for world, reach in sorted({(row["world"], row["reach"]) for row in rows}):
@@ -203,7 +203,7 @@ def summary(rows: list[dict[str, Any]]) -> tuple[dict[str, float], dict[str, flo
 
 
 def costs(_: argparse.Namespace) -> tuple[dict[str, float], dict[str, float]]:
-    """A map of 1000 x 1000 cells with rooms half of which are known: a changed tile, and a decision; processor time."""
+    """Measure the processor time of a changed tile, and of a decision, in a half-known map of 1000 x 1000 cells."""
     rng = np.random.default_rng(5)
     cells = np.full((1000, 1000), -1, np.int8)
     for row in range(0, 1000, 125):
@@ -241,7 +241,7 @@ def costs(_: argparse.Namespace) -> tuple[dict[str, float], dict[str, float]]:
 
 
 def message(cells: np.ndarray, column: int, row: int) -> Grid:
-    """A part of the map."""
+    """Return a part of the map."""
     rows, columns = cells.shape
     return Grid(
         stamp=0, received=0, seq=0, frame="map", resolution=0.05, width=columns, height=rows,

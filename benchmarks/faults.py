@@ -1,9 +1,9 @@
-"""Every scripted fault on the whole daemon, on the virtual clock: when it was noticed, when the truck stood, how far.
+"""Every scripted fault on the whole daemon, on the virtual clock: times to detection and standstill, and distance.
 
     python benchmarks/faults.py
 
-Each fault is made at several instants, so that it meets ticks and exchanges at different phases; the table shows
-the run in which the truck went furthest, the figures are the worst of all runs.
+Each fault is caused at several instants, so that it meets ticks and exchanges at different phases. The table shows the
+run with the longest distance; the figures are the worst of all runs.
 """
 
 import argparse
@@ -46,18 +46,18 @@ class Run:
 
     @property
     def scenario(self) -> Scenario:
-        """What was done."""
+        """Executed scenario."""
         return SCENARIOS[self.number]
 
 
 @cache
 def demo() -> SimulatedTruckConfig:
-    """The truck of the demo."""
+    """Return the truck of the demo."""
     return load_config(ROOT / "configs" / "demo.yaml", SimulatedTruckConfig)[0]
 
 
 def run(job: tuple[int, float]) -> Run:
-    """Drill one scenario."""
+    """Run one scenario."""
     number, driven = job
     logging.disable(logging.CRITICAL)
     reaction = run_virtual(lambda clock: measure(SCENARIOS[number], demo(), clock, driven))
@@ -65,7 +65,7 @@ def run(job: tuple[int, float]) -> Run:
 
 
 def figures(runs: Iterable[Run]) -> dict[str, float]:
-    """Worst of every kind, by the names of ``GOALS``; seconds."""
+    """Return the worst value of every kind, by the names of ``GOALS``; seconds."""
     worst = dict.fromkeys(GOALS, 0.0)
 
     def take(name: str, seconds: float | None) -> None:
@@ -88,7 +88,7 @@ def figures(runs: Iterable[Run]) -> dict[str, float]:
 
 
 def furthest(runs: Iterable[Run]) -> list[Run]:
-    """For every scenario the run with the longest way."""
+    """Return the run with the longest distance of every scenario."""
     worst: dict[int, Run] = {}
     for one in runs:
         if one.number not in worst or one.reaction.metres > worst[one.number].reaction.metres:
@@ -97,7 +97,7 @@ def furthest(runs: Iterable[Run]) -> list[Run]:
 
 
 def main() -> int:
-    """Run everything; 0 = all goals met."""
+    """Run all scenarios; 0: all goals are met."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--markdown", action="store_true", help="print the table for the documentation")
     markdown = parser.parse_args().markdown

@@ -1,10 +1,9 @@
-"""Files of other programs: what is read has the producer's values, what is no such file is refused by its name.
+"""Files of other programs: right values are read, and other files are refused by name.
 
-One row for each format: producers (excerpts of published files, examples of documentation, and files that another
-package writes here), values that differ, and damaged files that are not refused with their name. ``--lerobot PYTHON``
-is an interpreter with the package `lerobot-dataset`, which reads the exported data set. ``memory`` is the peak of
-reading a log of 200 MB, at its middle and at its end, and what follows from its growth for 10 GB. The last line is
-JSON.
+One row for each format: producers (excerpts of published files, examples of documentation, and files written here by
+another package), wrong values, and damaged files that are not refused by name. ``--lerobot PYTHON`` is an interpreter
+with the package `lerobot-dataset`, which reads the exported data set. ``memory`` is the peak while reading a log of 200
+MB, at its middle and at its end, and the extrapolation of its growth to 10 GB. The last line is JSON.
 
     python benchmarks/files.py [--lerobot PYTHON] [--no-memory]
 """
@@ -273,7 +272,7 @@ def lenses() -> dict[str, list[Example]]:
 
 
 def judged(examples: list[Example]) -> dict[str, Any]:
-    """Figures of a format; each example is damaged in five ways, which must be read or refused with its name."""
+    """Return the figures of a format; each example is damaged in five ways, and must be read or refused by name."""
     wrong, unnamed = [], 0
     for producer, text, read, expected in examples:
         try:
@@ -300,7 +299,7 @@ def judged(examples: list[Example]) -> dict[str, Any]:
 
 
 def logs(lerobot: str | None) -> dict[str, dict[str, Any]]:
-    """Exports, read by other programs."""
+    """Export logs and read them with other programs."""
     rows = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -345,7 +344,7 @@ SIZE = 200
 
 
 def write_log(file: Path) -> None:
-    """Write scans of 1081 beams and odometry, of which no two scans are equal."""
+    """Write different scans of 1081 beams, and odometry."""
     ranges, writer, seq = np.random.default_rng(1).uniform(0.2, 9.0, 1081), Writer(file), 0
     scan: dict[str, Any] = {"start_angle": -2.0, "end_angle": 2.0, "time_increment": 1e-4, "scan_time": 0.1}
     scan |= {"range_min": 0.1, "range_max": 10.0, "codes": np.full(1081, VALID_BEAM, np.uint8)}
@@ -360,7 +359,7 @@ def write_log(file: Path) -> None:
 
 
 def read_log(what: str, file: Path) -> None:
-    """Read a log; prints the peaks of this process's memory at half of it and at the end, MB."""
+    """Read a log; print the peaks of this process's memory at its middle and at its end, MB."""
     half: list[float] = []
 
     def peak() -> float:
@@ -381,7 +380,7 @@ def read_log(what: str, file: Path) -> None:
 
 
 def memory() -> dict[str, dict[str, Any]]:
-    """Peaks at half of a log and at its end, and what follows for 10 GB; MB."""
+    """Return the peaks at the middle and end of a log, and the extrapolation to 10 GB; MB."""
     rows = {}
     with tempfile.TemporaryDirectory() as name:
         file = Path(name) / "run.mcap"
@@ -397,7 +396,7 @@ def memory() -> dict[str, dict[str, Any]]:
 
 
 def main() -> int:
-    """Measure, print, return the exit code."""
+    """Measure and print; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--lerobot", help="interpreter with the package lerobot-dataset")
     parser.add_argument("--no-memory", action="store_true")

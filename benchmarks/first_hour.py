@@ -1,4 +1,4 @@
-"""What a new user waits for: from the clone to the first lap, and for the commands used first.
+"""Waiting times of a new user: from the clone to the first lap, and for the first commands.
 
     python benchmarks/first_hour.py [--trials 40] [--only NAME ...]
 
@@ -8,9 +8,9 @@
     status   from the start of `status` on a terminal of 80x24 to the first picture with the robot's mode, s
     goto     from the start of `goto`, to a daemon that has just started, to the first route, s; kernels compiled
 
-``estop``, ``status`` and ``goto`` talk to a daemon and an emulated truck in processes of their own; the goals are for
-two idle cores. ``estop`` and ``status`` keep daemon and truck on a core each; for ``goto`` the daemon and its workers
-have both, as a user's have. The last line is JSON.
+``estop``, ``status`` and ``goto`` connect to a daemon and an emulated truck in separate processes; the goals are for
+two idle cores. For ``estop`` and ``status``, daemon and truck have a core each; for ``goto`` the daemon and its workers
+use both cores, like a user's. The last line is JSON.
 """
 
 import argparse
@@ -52,7 +52,7 @@ WAIT = 60.0
 
 
 def lap() -> dict[str, float]:
-    """A clone drives its lap."""
+    """Drive the lap in a fresh clone."""
     with TemporaryDirectory(prefix="first-hour-") as folder:
         began = time.monotonic()
         subprocess.run(["git", "clone", "-q", str(ROOT), f"{folder}/clone"], check=True)
@@ -63,7 +63,7 @@ def lap() -> dict[str, float]:
 
 
 def help_text(trials: int) -> dict[str, float]:
-    """``--help`` again and again."""
+    """Time ``--help`` repeatedly."""
 
     def once() -> float:
         began = time.monotonic()
@@ -80,10 +80,10 @@ async def robot(
     """An emulated truck with its daemon, a client, the endpoint, and the quick stops on the drive's wire.
 
     Args:
-        clock: time.
-        folder: for configuration and outputs.
-        config: in ``configs``.
-        apart: truck and daemon have a core each.
+        clock: source of time.
+        folder: folder for configuration and outputs.
+        config: file in ``configs``.
+        apart: whether truck and daemon have a core each.
     """
     endpoint = free_endpoint()
     overlay = write_overlay(ROOT / "configs" / config, folder, endpoint)
@@ -104,7 +104,7 @@ async def robot(
 
 
 async def estop(clock: Clock, folder: Path, trials: int) -> dict[str, float]:
-    """The truck drives, the command is started."""
+    """Start the command while the truck drives."""
     found = []
     async with robot(clock, folder, "demo.yaml") as (client, endpoint, stops):
         for trial in range(trials):
@@ -127,14 +127,14 @@ async def estop(clock: Clock, folder: Path, trials: int) -> dict[str, float]:
 
 
 async def status(clock: Clock, folder: Path, trials: int) -> dict[str, float]:
-    """The live screen."""
+    """Time the live screen."""
     async with robot(clock, folder, "demo.yaml") as (_, endpoint, _):
         found = [await asyncio.to_thread(first_picture, endpoint, b"disarmed") for _ in range(trials)]
     return {"status": median(found)}
 
 
 def first_picture(endpoint: str, text: bytes) -> float:
-    """Seconds until ``status`` shows ``text``."""
+    """Return the seconds until ``status`` shows ``text``."""
     began = time.monotonic()
     child, terminal = pty.fork()
     if child == 0:
@@ -158,7 +158,7 @@ def first_picture(endpoint: str, text: bytes) -> float:
 
 
 async def goto(clock: Clock, folder: Path) -> dict[str, float]:
-    """Twice, each with a new daemon: the first one has kernels compiled that are not."""
+    """Time a new daemon twice: the first one compiles missing kernels."""
     taken = 0.0
     for turn in ("first", "second"):
         (folder / turn).mkdir()
@@ -181,7 +181,7 @@ async def goto(clock: Clock, folder: Path) -> dict[str, float]:
 
 
 def served(part: Callable[..., Any], *arguments: int) -> dict[str, float]:
-    """A part that needs a robot."""
+    """Run a part that needs a robot."""
 
     async def main(clock: Clock) -> dict[str, float]:
         with TemporaryDirectory(prefix="first-hour-") as folder:
@@ -192,7 +192,7 @@ def served(part: Callable[..., Any], *arguments: int) -> dict[str, float]:
 
 
 def main() -> int:
-    """Measure; 0 = all goals met."""
+    """Measure; 0: all goals are met."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--trials", type=int, default=40)
     parts: dict[str, Callable[[int], dict[str, float]]] = {

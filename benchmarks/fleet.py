@@ -66,7 +66,7 @@ WITHOUT = 6.0
 
 
 def publish(files: list[Path]) -> None:
-    """Robots of one process, by their configurations."""
+    """Run the robots of one process, given by their configurations."""
 
     async def all_of_them(clock: Clock) -> None:
         await asyncio.gather(
@@ -80,7 +80,7 @@ def publish(files: list[Path]) -> None:
 
 
 def route(file: Path) -> None:
-    """The router, until standard input ends."""
+    """Run the router until standard input ends."""
     with zenoh.open(zenoh.Config.from_json5(file.read_text())):
         print("ready", flush=True)
         sys.stdin.read()
@@ -88,7 +88,7 @@ def route(file: Path) -> None:
 
 @dataclass
 class Prepared:
-    """Files of all, and where the router listens."""
+    """Files of all robots, and the endpoint of the router."""
 
     folder: Path
     names: list[str]
@@ -98,12 +98,12 @@ class Prepared:
     endpoint: str
 
     def own_endpoint(self, robot: str) -> str:
-        """Where the robot itself listens."""
+        """Return the robot's own endpoint."""
         return str(self.settings[robot]["listen"][0])
 
 
 def prepare(folder: Path, count: int) -> Prepared:
-    """Certificates and settings of all."""
+    """Write certificates and settings of all robots."""
     now = (WallClock().now() + WallClock().real_offset()) // SECOND
     endpoint = free_endpoint().replace("tcp/", "tls/")
     names = [f"robot{number}" for number in range(count)]
@@ -121,14 +121,14 @@ def prepare(folder: Path, count: int) -> Prepared:
 
 
 def publisher_file(made: Prepared, robot: str) -> Path:
-    """Settings of a robot that only publishes."""
+    """Write the settings of a robot that only publishes."""
     file = made.folder / f"{robot}.json"
     file.write_text(json.dumps(made.settings[robot]))
     return file
 
 
 def whole_file(made: Prepared, robot: str, otherwise: dict[str, Any]) -> Path:
-    """Configuration of a whole robot."""
+    """Write the configuration of a complete robot."""
     file = write_overlay(ROOT / "configs" / "demo.yaml", made.folder / f"{robot}-whole", made.own_endpoint(robot))
     overlay = {**read_yaml(file), "robot": robot, "zenoh": made.settings[robot], **otherwise}
     file.write_text(yaml_text(overlay))
@@ -136,35 +136,35 @@ def whole_file(made: Prepared, robot: str, otherwise: dict[str, Any]) -> Path:
 
 
 def station_files(folder: Path, robot: str) -> ClientTls:
-    """Certificate of the page as a robot made it."""
+    """Return the page's certificate issued by a robot."""
     own = folder / robot / "stations" / STATION
     return ClientTls(ca=own / "ca.pem", certificate=own / "station.pem", key=own / "station.key")
 
 
 class Heard:
-    """When which message came, by its bytes; and how many bytes of each robot."""
+    """Arrival times of messages, by their bytes, and the received bytes of each robot."""
 
     def __init__(self) -> None:
         self.at: dict[bytes, int] = {}
         self.bytes: dict[str, int] = {}
 
     def arrival(self, sample: zenoh.Sample) -> None:
-        """A message of a robot that is measured; its bytes tell it from others."""
+        """Note a message of a measured robot; its bytes identify it."""
         self.at[sample.payload.to_bytes()] = time.monotonic_ns()
 
     def count(self, sample: zenoh.Sample) -> None:
-        """Any message."""
+        """Count any message."""
         robot = str(sample.key_expr).split("/")[1]
         self.bytes[robot] = self.bytes.get(robot, 0) + len(sample.payload)
 
 
 class GivenUpError(Exception):
-    """Something did not come up; who, and what it said last."""
+    """A process did not become ready; the text names it and its last line."""
 
 
 @dataclass
 class Program:
-    """A process that is read all the time: what it said last is reported where it ends or does not come up."""
+    """A process whose output is read continuously; its last line is reported if it ends or does not become ready."""
 
     name: str
     running: asyncio.subprocess.Process
@@ -195,13 +195,13 @@ class Program:
 async def program(
     name: str, *words: str, ready: int = 1, environment: dict[str, str] | None = None
 ) -> AsyncIterator[Program]:
-    """A process while the context lasts, which is killed at its end.
+    """Run a process for the duration of the context, and kill it at the end.
 
     Args:
-        name: for messages.
-        words: behind ``python -m``.
-        ready: how often it says that it is ready; it is waited for by ``come_up``.
-        environment: more of it.
+        name: name for messages.
+        words: arguments after ``python -m``.
+        ready: number of lines that report readiness, awaited by ``come_up``.
+        environment: additional environment.
     """
     pipe = asyncio.subprocess.PIPE
     running = await asyncio.create_subprocess_exec(
@@ -220,7 +220,7 @@ async def program(
 
 
 async def page(url: str, rows: list[dict[str, Any]]) -> None:
-    """A browser that follows the first robot and looks at the fleet."""
+    """Run a browser that follows the first robot and shows the fleet."""
     async with (
         aiohttp.ClientSession() as session,
         session.ws_connect(f"{url}socket", origin=url[:-1], max_msg_size=0) as socket,
@@ -239,7 +239,7 @@ async def page(url: str, rows: list[dict[str, Any]]) -> None:
 
 
 async def until(condition: Callable[[], bool], seconds: float) -> float:
-    """Seconds until a condition holds; infinite if it does not in time."""
+    """Return the seconds until a condition is true; infinite if it is not in time."""
     began = time.monotonic()
     while time.monotonic() - began < seconds:
         if condition():
@@ -249,7 +249,7 @@ async def until(condition: Callable[[], bool], seconds: float) -> float:
 
 
 async def missing(session: zenoh.Session, names: list[str], seconds: float) -> list[str]:
-    """Robots that are not seen through the router within this time."""
+    """Return the robots that do not appear through the router within this time."""
 
     def seen() -> set[str]:
         replies = session.liveliness().get(alive_key("*"), timeout=2.0)
@@ -264,7 +264,7 @@ async def missing(session: zenoh.Session, names: list[str], seconds: float) -> l
 
 
 class Whole:
-    """A whole robot: seen by its own endpoint, ordered through the router."""
+    """A complete robot: observed by its own endpoint, commanded through the router."""
 
     def __init__(self, made: Prepared, robot: str) -> None:
         own, tls = station_files(made.folder, robot), station_files(made.folder, made.names[0])
@@ -292,17 +292,17 @@ class Whole:
 
     @property
     def place(self) -> np.ndarray:
-        """By its odometry, m."""
+        """Position by its odometry, m."""
         pose = self.odometry.latest.pose if self.odometry.latest else None
         return np.array([pose.x, pose.y]) if pose else np.full(2, np.nan)
 
     @property
     def moves(self) -> bool:
-        """Whether its odometry says so."""
+        """Whether its odometry shows motion."""
         return self.odometry.latest is not None and abs(self.odometry.latest.twist.vx) > 0.02
 
     async def drive(self, *, by_hand: bool) -> None:
-        """Arm it through the router, again where a busy computer's late samples stop it; by hand it goes to and fro."""
+        """Arm it through the router, again after stops by late samples; by hand it drives to and fro."""
         start, speed = self.place, 0.1
         while True:
             with contextlib.suppress(TruckError, zenoh.ZError, TimeoutError):
@@ -317,7 +317,7 @@ class Whole:
 
 @dataclass
 class Fleet:
-    """Processes of all robots; the whole ones are the last."""
+    """Processes of all robots; the complete ones are the last."""
 
     made: Prepared
     publishing: list[Program]
@@ -330,11 +330,11 @@ class Fleet:
 
     @property
     def whole(self) -> list[str]:
-        """Names of whole robots."""
+        """Names of complete robots."""
         return self.made.names[-len(WHOLE) :]
 
     async def start(self, stack: AsyncExitStack) -> None:
-        """Start all; robots are there when they are seen through the router."""
+        """Start all, and wait until they appear through the router."""
         for n in range(0, len(self.publishers), TOGETHER):
             batch = self.publishers[n : n + TOGETHER]
             files = [str(publisher_file(self.made, robot)) for robot in batch]
@@ -351,10 +351,10 @@ class Fleet:
 
 
 async def measure(folder: Path, count: int, seconds: float) -> dict[str, Any]:
-    """Everything.
+    """Measure all figures.
 
     Raises:
-        GivenUpError: a process did not come up, or a robot is missing.
+        GivenUpError: a process did not become ready, or a robot is missing.
     """
     made = await asyncio.to_thread(prepare, folder, count)
     figures: dict[str, Any] = {"robots": count, "whole": len(WHOLE), "load_average": round(os.getloadavg()[0], 1)}
@@ -401,7 +401,7 @@ async def _both_move(by_itself: Whole, by_hand: Whole) -> None:
 
 
 async def _costs(fleet: Fleet, router: Program, station: Program, seconds: float) -> dict[str, Any]:
-    """Delay, processor time and bytes, with a recorder."""
+    """Return delay, processor time and bytes, with a recorder."""
     made = fleet.made
     everything, direct, routed = Heard(), Heard(), Heard()
     tls = station_files(made.folder, made.names[0])
@@ -446,7 +446,7 @@ async def _costs(fleet: Fleet, router: Program, station: Program, seconds: float
 async def _without_router(
     router: AsyncExitStack, by_itself: Whole, by_hand: Whole, rows: list[dict[str, Any]]
 ) -> dict[str, Any]:
-    """Kill the router, and see what the whole robots do."""
+    """Kill the router, and observe the complete robots."""
     before = [robot.stop.latest for robot in (by_itself, by_hand)]
     began, place = time.monotonic(), by_itself.place
     gone = asyncio.create_task(until(lambda: not any(row["alive"] for row in rows), 30))
@@ -468,7 +468,7 @@ async def _without_router(
 
 
 async def _during(stack: AsyncExitStack, work: Coroutine[Any, Any, None]) -> None:
-    """Work until the stack is left."""
+    """Run work until the stack is closed."""
     task = asyncio.create_task(work)
 
     async def end() -> None:
@@ -489,7 +489,7 @@ def _open(endpoint: str, tls: ClientTls) -> zenoh.Session:
 
 
 def main() -> int:
-    """Measure; 0 = all goals met."""
+    """Measure; 0: all goals are met."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--robots", type=int, default=20, help="at least 3, of which 2 are whole")
     parser.add_argument("--seconds", type=float, default=30.0)

@@ -82,7 +82,7 @@ CONTACT = re.compile(r"contact: (.+) at ([\d.]+) m/s with (.+) at ([\d.]+) m/s")
 
 @dataclass
 class Score:
-    """What one robot did."""
+    """Record of one robot."""
 
     tasks: int = 0
     moves: int = 0
@@ -93,7 +93,7 @@ class Score:
 
 
 def configurations(folder: Path) -> list[Path]:
-    """A file for every robot, with its name, place and folders."""
+    """Write a file for every robot, with its name, place and folders."""
     files = []
     endpoints = {kind: free_endpoint() for kind in ROBOTS}
     for i, (kind, (x, y, yaw)) in enumerate(ROBOTS.items()):
@@ -122,15 +122,15 @@ def configurations(folder: Path) -> list[Path]:
 
 @dataclass
 class Pilot:
-    """Drives one robot from drawn place to drawn place.
+    """Drives one robot from one drawn place to the next.
 
     Args:
-        driver: its client.
-        clock: time.
-        seed: of places and pauses.
-        score: what it does.
-        pose: newest pose of the robot.
-        number: of the robot in ``ROBOTS``.
+        driver: client of the robot.
+        clock: source of time.
+        seed: seed of places and pauses.
+        score: record of the robot.
+        pose: latest pose of the robot.
+        number: number of the robot in ``ROBOTS``.
     """
 
     driver: Operator
@@ -144,7 +144,7 @@ class Pilot:
     peers: Mailbox[Peers] = field(init=False)
 
     async def patrol(self, until: int) -> None:
-        """Until then, ns."""
+        """Drive until an instant, ns."""
         self.rng = np.random.default_rng(self.seed)
         places = [self.draw() for _ in range(PENDING)]
         with (
@@ -162,12 +162,12 @@ class Pilot:
                     places.append(place)  # somebody may stand there: later
 
     def draw(self) -> tuple[float, float]:
-        """A place in the yard, m."""
+        """Return a place in the yard, m."""
         x, y = self.rng.uniform(-HALF, HALF, 2).tolist()
         return x, y
 
     def passes(self, place: tuple[float, float]) -> bool:
-        """Whether the straight line to a place leads past the others, as far as they are heard."""
+        """Whether the straight line to a place passes the other robots by their reported poses."""
         if self.pose.latest is None or self.peers.latest is None:
             return True
         start = np.array((self.pose.latest.pose.x, self.pose.latest.pose.y))
@@ -176,7 +176,7 @@ class Pilot:
         return bool((np.hypot(*(line[:, None] - others[None]).T) > PASSES).all())
 
     async def go_to(self, x: float, y: float, until: int) -> None:
-        """Turn to a place and drive there; after a stop make way and try again."""
+        """Turn to a place and drive there; after a stop give way and try again."""
         while self.clock.now() < until:
             if (newest := self.pose.latest) is None:
                 await self.clock.sleep(0.2)
@@ -201,7 +201,7 @@ class Pilot:
                 await self.move(length=float(self.rng.uniform(0.2, 0.8)), speed=0.15)
 
     async def make_way(self) -> bool:
-        """Whether it left others the way, or waited until they left it; False: no robot is near, or it cannot move."""
+        """Give way, or wait until the others have; return False if no robot is near, or it cannot move."""
         assert self.pose.latest is not None
         me, heard = self.pose.latest.pose, self.peers.latest
         others = {} if heard is None else {peer.robot: (me.x - peer.pose.x, me.y - peer.pose.y) for peer in heard.peers}
@@ -219,15 +219,15 @@ class Pilot:
         return await self.move(length=float(self.rng.uniform(0.4, 0.8)), speed=0.18)
 
     def rank(self, number: int) -> int:
-        """0 for the robot that has the right of way before all others at present."""
+        """Return the robot's rank; the robot of rank 0 currently has the right of way."""
         return (number - int(self.clock.now() / SECOND / TURN_OF_EACH)) % len(ROBOTS)
 
     async def turn(self, angle: float) -> bool:
-        """Whether it turned on the spot."""
+        """Turn on the spot; return whether it did."""
         return await self.move(radius=0.0, angle=angle)
 
     async def move(self, **settings: float) -> bool:
-        """Whether a move came to its end."""
+        """Run a move; return whether it was completed."""
         self.score.moves += 1
         gate = self.gate.latest
         try:
@@ -244,7 +244,7 @@ class Pilot:
 
 @dataclass
 class Run:
-    """What came of it."""
+    """Record of a run."""
 
     scores: dict[str, Score]
     contacts: list[tuple[str, float, str, float]]
@@ -258,7 +258,7 @@ class Run:
 
 
 def on_virtual_clock(seconds: float, seed: int) -> Run:
-    """All daemons in this process."""
+    """Run all daemons in this process."""
     with TemporaryDirectory() as folder:
         configs = [load_simulated(file) for file in configurations(Path(folder))]
     scores = {config.robot: Score() for config in configs}
@@ -281,7 +281,7 @@ def on_virtual_clock(seconds: float, seed: int) -> Run:
 
 
 async def compare_poses(rig: VirtualRig, pose: Mailbox[Odometry], until: int, score: Score) -> None:
-    """Compare a robot's pose with the world's truth once a second until then, ns."""
+    """Compare a robot's pose with the world's truth once a second until an instant, ns."""
     while rig.clock.now() < until:
         await rig.clock.sleep(1.0)
         if (newest := pose.latest) is not None:
@@ -290,7 +290,7 @@ async def compare_poses(rig: VirtualRig, pose: Mailbox[Odometry], until: int, sc
 
 
 def in_processes(seconds: float, seed: int) -> Run:
-    """One simulator, and a daemon process for each robot."""
+    """Run one simulator, and a daemon process for each robot."""
     scores = {name: Score() for name in ROBOTS}
     lines: list[str] = []
 
@@ -325,7 +325,7 @@ def in_processes(seconds: float, seed: int) -> Run:
 
 @asynccontextmanager
 async def simulator(files: Iterable[Path], truth: Path, lines: list[str]) -> AsyncIterator[asyncio.subprocess.Process]:
-    """The processes while the context lasts; ``lines`` gets what the simulator prints."""
+    """Run the processes for the duration of the context; ``lines`` receives the simulator's output."""
     command = ("simulate", "--robots", ",".join(map(str, files)), "--run", "--truth", str(truth))
     with (truth.parent / "daemons.txt").open("wb") as errors:
         process = await asyncio.create_subprocess_exec(
@@ -355,7 +355,7 @@ async def simulator(files: Iterable[Path], truth: Path, lines: list[str]) -> Asy
 
 
 async def connected(clock: Clock, robot: str, endpoint: str) -> TruckClient:
-    """A client of a robot, once it answers."""
+    """Return a client of a robot once it answers."""
     async with clock.deadline(180.0):
         while True:
             client = TruckClient(robot, endpoint, clock=clock, timeout=5.0)

@@ -1,9 +1,9 @@
-"""A byte fuzzer for every parser: no exception, bounded buffers, back in step within two frames.
+"""Byte fuzzer for every parser: no exception, bounded buffers, synchronised again within two frames.
 
     python benchmarks/fuzz.py [--bytes 10000000] [--seed 1] [PARSER ...]
 
-Each parser gets noise, and its own frames with bits flipped, bytes lost, doubled and cut, in pieces of any size. Every
-64 kB correct frames follow: how many of them are lost is what it took to get back in step.
+Each parser receives noise and its own frames with flipped bits, lost, doubled and truncated bytes, in pieces of any
+size. Valid frames follow every 64 kB: the number of lost ones measures the resynchronisation.
 """
 
 import argparse
@@ -52,8 +52,8 @@ class Stream:
     """A parser that finds its frames in a stream.
 
     Args:
-        make: a fresh parser.
-        frames: correct ones, as bytes and as what they are parsed to.
+        make: creates a parser.
+        frames: valid frames, as bytes and as parsed.
     """
 
     make: Callable[[], Any]
@@ -64,12 +64,12 @@ class Stream:
 
 @dataclass(frozen=True)
 class Whole:
-    """A parser of whole frames: raises one of ``refuses``, or accepts.
+    """A parser of complete frames: raises one of ``refuses``, or accepts.
 
     Args:
-        parse: it.
-        refuses: how it says no.
-        frames: correct ones.
+        parse: the parser.
+        refuses: exceptions of a refusal.
+        frames: valid frames.
     """
 
     parse: Callable[[bytes], Any]
@@ -78,7 +78,7 @@ class Whole:
 
 
 def parsers() -> dict[str, Stream | Whole]:
-    """By name."""
+    """Return all parsers by name."""
     rng = np.random.default_rng(0)
     ranges = scip.encode_array(rng.integers(20, 4000, 120), 3)
     replies = [
@@ -160,7 +160,7 @@ def _scan(rng: np.random.Generator) -> bytes:
 
 
 def damaged(rng: np.random.Generator, frames: list[bytes], size: int) -> bytes:
-    """``size`` bytes of noise and broken frames."""
+    """Return ``size`` bytes of noise and damaged frames."""
     out = bytearray()
     while len(out) < size:
         out += broken(rng, frames) if rng.random() < 0.7 else rng.bytes(int(rng.integers(1, 400)))
@@ -168,7 +168,7 @@ def damaged(rng: np.random.Generator, frames: list[bytes], size: int) -> bytes:
 
 
 def broken(rng: np.random.Generator, frames: list[bytes]) -> bytes:
-    """One frame with something wrong, or nothing."""
+    """Return one frame, possibly damaged."""
     data = bytearray(frames[rng.integers(len(frames))])
     for _ in range(rng.integers(0, 4)):
         at = int(rng.integers(len(data))) if data else 0
@@ -187,7 +187,7 @@ def broken(rng: np.random.Generator, frames: list[bytes]) -> bytes:
 
 
 def pieces(rng: np.random.Generator, data: bytes) -> Iterator[bytes]:
-    """Cut as a line cuts it: single bytes up to kilobytes."""
+    """Split the data as a serial line may: from single bytes to kilobytes."""
     at = 0
     while at < len(data):
         size = int(2 ** rng.uniform(0, 12))
@@ -196,7 +196,7 @@ def pieces(rng: np.random.Generator, data: bytes) -> Iterator[bytes]:
 
 
 def held(parser: Any) -> int:
-    """Bytes it keeps."""
+    """Return the number of buffered bytes."""
     names = [*getattr(parser, "__dict__", ()), *getattr(type(parser), "__slots__", ())]
     values = [getattr(parser, name) for name in names if hasattr(parser, name)]
     lists = [item for value in values if isinstance(value, list) for item in value]
@@ -207,7 +207,7 @@ def held(parser: Any) -> int:
 
 
 def fuzz_stream(stream: Stream, total: int, rng: np.random.Generator) -> dict[str, Any]:
-    """Figures of a stream's parser."""
+    """Return the figures of a stream parser."""
     parser, sent, most, lost = stream.make(), 0, 0, 0
     frames = [data for data, _ in stream.frames]
     again = [stream.frames[n % len(frames)] for n in range(FRAMES)]
@@ -222,7 +222,7 @@ def fuzz_stream(stream: Stream, total: int, rng: np.random.Generator) -> dict[st
 
 
 def _found(found: list[Any], wanted: list[Any]) -> int:
-    """How many of the newest frames are there, from the end."""
+    """Return the number of the latest frames that were found, counted from the end."""
     count = 0
     for a, b in zip(reversed(found), reversed(wanted), strict=False):
         if a != b:
@@ -232,7 +232,7 @@ def _found(found: list[Any], wanted: list[Any]) -> int:
 
 
 def fuzz_whole(whole: Whole, total: int, rng: np.random.Generator) -> dict[str, Any]:
-    """Figures of a parser of whole frames."""
+    """Return the figures of a parser of complete frames."""
     sent = accepted = 0
     while sent < total:
         data = broken(rng, whole.frames) if rng.random() < 0.8 else rng.bytes(int(rng.integers(0, 400)))
@@ -248,7 +248,7 @@ def fuzz_whole(whole: Whole, total: int, rng: np.random.Generator) -> dict[str, 
 
 
 def fuzz_exchange(total: int, rng: np.random.Generator) -> dict[str, Any]:
-    """Figures of the EPOS handshake: its frames have no marks to search for, so it takes part as a whole."""
+    """Return the figures of the EPOS handshake, tested as a whole because its frames have no start marks."""
 
     async def main(clock: VirtualClock) -> dict[str, Any]:
         port = MemoryPort("epos")
@@ -284,7 +284,7 @@ async def _reads(exchanger: Exchanger) -> bool:
 
 
 def run(total: int, seed: int, only: list[str]) -> dict[str, dict[str, Any]]:
-    """Figures of every parser; one that raises is not ok."""
+    """Return the figures of every parser; one that raises is not ok."""
     results: dict[str, dict[str, Any]] = {}
     fuzzers: dict[str, Callable[[int, np.random.Generator], dict[str, Any]]] = {"epos-exchange": fuzz_exchange}
     for name, parser in parsers().items():
@@ -303,7 +303,7 @@ def run(total: int, seed: int, only: list[str]) -> dict[str, dict[str, Any]]:
 
 
 def main() -> int:
-    """Fuzz; 0 = nothing found."""
+    """Fuzz; 0: no fault found."""
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("only", nargs="*", metavar="PARSER")
     options.add_argument("--bytes", type=int, default=10_000_000)

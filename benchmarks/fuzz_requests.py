@@ -55,7 +55,7 @@ BODIES: list[dict[str, Any]] = [
 
 
 def payload(rng: np.random.Generator) -> bytes:
-    """One message: noise, or a request that is nearly right."""
+    """Return one message: noise, or a nearly valid request."""
     if rng.random() < 0.2:
         return rng.bytes(int(rng.integers(0, 300)))
     now = time.monotonic_ns()
@@ -82,7 +82,7 @@ def payload(rng: np.random.Generator) -> bytes:
 
 
 def fuzz(endpoint: str, names: list[str], count: int, seed: int, rate: float) -> None:
-    """Send; prints how many. Of a ``tls/`` endpoint with this user's certificate, under its name."""
+    """Send messages; print their number. A ``tls/`` endpoint is used with this user's certificate and name."""
     rng = np.random.default_rng(seed)
     tls = tls_for(endpoint)
     owner = "fuzz{}" if tls is None else tls.owner()
@@ -103,7 +103,7 @@ def fuzz(endpoint: str, names: list[str], count: int, seed: int, rate: float) ->
 
 
 async def call_names(client: TruckClient) -> list[str]:
-    """All calls that the robot answers: it lists them where there is no such one."""
+    """Return all calls served by the robot: it lists them in the answer to an unknown call."""
     try:
         await client.call("no-such-call")
     except TruckError as error:
@@ -112,7 +112,7 @@ async def call_names(client: TruckClient) -> list[str]:
 
 
 async def attack(clock: Clock, folder: Path, count: int, seed: int, rate: float) -> dict[str, Any]:
-    """One run."""
+    """Run once."""
     endpoint = free_endpoint()
     config = write_overlay(ROOT / "configs" / "demo.yaml", folder, endpoint)
     async with (
@@ -165,7 +165,7 @@ async def attack(clock: Clock, folder: Path, count: int, seed: int, rate: float)
 
 
 def of_gates(ticks: int, seed: int) -> int:
-    """Fuzz the gates of all bodies; 0 = all goals met."""
+    """Fuzz the gates of all bodies; 0: all goals are met."""
     from benchmarks.fuzz_parts import gate  # noqa: PLC0415 - needs the tests
     from tests.unit.gate.rig import BODIES  # noqa: PLC0415
 
@@ -182,7 +182,7 @@ def of_gates(ticks: int, seed: int) -> int:
 
 
 def main() -> int:
-    """Fuzz; 0 = all goals met."""
+    """Fuzz; 0: all goals are met."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--gate", action="store_true", help="the gates of all bodies, without a daemon")
     parser.add_argument("--count", type=int, default=100_000, help="messages, or ticks of gates")

@@ -82,7 +82,7 @@ Place = tuple[str, int]
 
 @dataclass
 class Drive:
-    """What came of one drive."""
+    """Record of one drive."""
 
     world: str
     number: int
@@ -118,14 +118,14 @@ class _Touch:
     """m."""
 
     def look(self, now: int, state: GateState, place: tuple[float, float]) -> None:
-        """Whether the gate says so, and how far the truck is from the place."""
+        """Note whether the gate reports the contact, and the distance of the truck from its place."""
         if self.noticed is None and Reason.CONTACT in state.reasons:
             self.noticed = (now - self.at) / SECOND
         self.away = max(self.away, math.dist(place, self.place))
 
 
 def end_touch(touched: _Touch | None, now: int, out: Drive) -> None:
-    """The operator asks for another motion, or the drive ends; what was shorter than the time to notice is left out."""
+    """End a contact when the operator changes the motion or the drive ends; contacts too short to be noticed do not count."""
     if touched is None:
         return
     lasted = (now - touched.at) / SECOND
@@ -138,7 +138,7 @@ def end_touch(touched: _Touch | None, now: int, out: Drive) -> None:
 
 
 def truck(world: str, seed: int, *, scans_alone: bool = False) -> SimulatedTruckConfig:
-    """The emulated truck with nothing that drives by itself; alone: the gate takes no current for a contact."""
+    """Return the emulated truck without planners; ``scans_alone``: the gate reads no current for contacts."""
     config = load_config(ROOT / "configs" / "demo.yaml", SimulatedTruckConfig)[0]
     config = config.model_copy(update={"recorder": None, "tracker": None, "path": None, "map": None})
     gate = {"contact": {"rise": 10.0, "rolling": 2.0}} if scans_alone else {}
@@ -162,7 +162,7 @@ async def put(rig: VirtualRig, clock: VirtualClock, rng: random.Random) -> None:
 async def drive(
     rig: VirtualRig, clock: VirtualClock, hand: LocalOperator, rng: random.Random, confirm: float, out: Drive
 ) -> None:
-    """Drive for a minute; counts what happens."""
+    """Drive for a minute and count the results."""
     gate = rig.bus.subscribe(topics.GATE, latest())
     change, speed, front, rear, unseen, name, stood = 0, 0.0, 0.0, 0.0, False, "", 0.0
     end = clock.now() + round(DRIVE * SECOND)
@@ -219,7 +219,7 @@ async def drive(
 
 
 def driven(world: str, number: int, seed: int, confirm: float, scans_alone: bool) -> Drive:
-    """Drive once with a truck and a daemon of its own."""
+    """Run one drive with a separate truck and daemon."""
 
     async def main(clock: VirtualClock) -> Drive:
         out = Drive(world, number, NOTICED_BY_SCANS if scans_alone else NOTICED)
@@ -236,13 +236,13 @@ def driven(world: str, number: int, seed: int, confirm: float, scans_alone: bool
 
 
 def places(worlds: Iterable[str], count: int) -> Iterable[Place]:
-    """Every drive: evenly over the worlds, and so from the start."""
+    """Yield all drives, evenly over the worlds at any time."""
     worlds = tuple(worlds)
     return ((worlds[index % len(worlds)], index // len(worlds)) for index in range(count))
 
 
 def digest(options: argparse.Namespace) -> str:
-    """Name of drives with these options by the present sources."""
+    """Return a name for drives with these options and the present sources."""
     made = blake2s(repr((options.seed, options.confirm, options.scans_alone)).encode(), digest_size=10)
     for place in map(ROOT.joinpath, SOURCES):
         files = sorted(place.rglob("*")) if place.is_dir() else [place]
@@ -259,7 +259,7 @@ def kept(name: str) -> dict[Place, Drive]:
 
 
 def drives(options: argparse.Namespace) -> list[Drive]:
-    """All drives that the time allows, those of earlier runs included."""
+    """Run all drives that the time allows; return them with those of earlier runs."""
     end, name = perf_counter() + 60 * options.minutes, digest(options)
     found, every = kept(name), list(places(options.worlds, options.count))
     todo = [place for place in every if place not in found]
@@ -276,7 +276,7 @@ def drives(options: argparse.Namespace) -> list[Drive]:
 
 
 def main() -> int:
-    """Drive; 0 = no contact that nobody confirmed."""
+    """Drive; 0: no contact without confirmation."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)

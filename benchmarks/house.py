@@ -2,16 +2,16 @@
 
     python benchmarks/house.py [--list]
 
-Reads the sources as text and syntax trees. Counted are the files that git tracks in the packages, without
-tests, benchmarks and docs. ``--list`` prints what was counted. The last line is JSON.
+Reads the sources as text and syntax trees: the files tracked by git in the packages, without tests, benchmarks and
+docs. ``--list`` prints the counted items. The last line is JSON.
 
-*Places to change* are the files that one more of a kind changes, beside its own: of the trial changes that
-``tests/daemon/test_trial_changes.py`` makes and runs; of trackers and explorers, the files that name a present one. A
-*module number* is an assignment at module level whose value is made of numbers: a literal, arithmetic with a literal,
-or a tuple of these. A *reader* of a file is a file of the packages or of ``systemd`` that imports it; a file that a
-catalog row names (``module:name``) stays a file of its kind. *Core* is what a robot needs to own its devices, estimate,
-map, plan, track, be stopped, be recorded and be operated; ``REST`` names everything else. A file may hold one number
-for every 100 lines begun: a file of fewer than 100 lines cannot hold a part of a number.
+*Places to change* are the files changed by one more of a kind, beside its own: for the trial changes made and run by
+``tests/daemon/test_trial_changes.py``; for trackers and explorers, the files that name a present one. A *module number*
+is an assignment at module level whose value is made of numbers: a literal, arithmetic with a literal, or a tuple of
+these. A *reader* of a file is a file of the packages or of ``systemd`` that imports it; a file named by a catalog row
+(``module:name``) stays a file of its kind. *Core* is what a robot needs to own its devices, estimate, map, plan, track,
+be stopped, be recorded and be operated; ``REST`` names everything else. A file may hold one number for every 100 lines
+begun: a file of fewer than 100 lines cannot hold a part of a number.
 """
 
 import argparse

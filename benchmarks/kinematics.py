@@ -1,8 +1,8 @@
-"""Kinematics: the library against a straight-line numpy script of the same formulas, and a control tick's calls.
+"""Kinematics: the library against a plain numpy script of the same formulas, and the calls of a control tick.
 
     python benchmarks/kinematics.py
 
-Last line: one JSON object with the figures, the goals and whether all are met.
+The last line is one JSON object with the figures, the goals and whether all are met.
 """
 
 import json
@@ -35,7 +35,7 @@ def script_inverse(vx: Array, vy: Array, wz: Array) -> tuple[Array, Array, Array
 
 
 def ratio(ours: Callable[[], object], theirs: Callable[[], object]) -> tuple[float, float, float]:
-    """Median times of both, s, run in turns so that the machine's mood hits both alike, and their median ratio."""
+    """Return the median times of both (s), run in turns so that load affects both equally, and their median ratio."""
     pairs = [(timeit.timeit(ours, number=1), timeit.timeit(theirs, number=1)) for _ in range(ROUNDS)]
     mine, script = (statistics.median(column) for column in zip(*pairs, strict=True))
     return mine, script, statistics.median(a / b for a, b in pairs)

@@ -55,7 +55,7 @@ class Calls:
         self._counted: dict[str, bool] = {}
 
     def __call__(self, frame: FrameType, event: str, _argument: Any) -> None:
-        """Take an event of the interpreter, see ``sys.setprofile``."""
+        """Process an event of the interpreter, see ``sys.setprofile``."""
         if event in ("call", "c_call"):
             name = frame.f_code.co_filename
             counted = self._counted.get(name)

@@ -99,7 +99,7 @@ print(count)
 
 @asynccontextmanager
 async def process(*arguments: str) -> AsyncIterator[asyncio.subprocess.Process]:
-    """A Python process while the context lasts; SIGTERM ends it."""
+    """Run a Python process for the duration of the context; SIGTERM ends it."""
     pipe = asyncio.subprocess.PIPE
     running = await asyncio.create_subprocess_exec(
         sys.executable, *arguments, stdin=pipe, stdout=pipe, stderr=asyncio.subprocess.DEVNULL
@@ -113,7 +113,7 @@ async def process(*arguments: str) -> AsyncIterator[asyncio.subprocess.Process]:
 
 
 async def drive(client: TruckClient, clock: Clock, drives: "Drives", *, laps: bool) -> None:
-    """Keep the truck driving: one lap after the other, or as the goals have it; armed again after every stop."""
+    """Keep the truck driving: lap after lap, or to goals; armed again after every stop."""
     while laps:
         lap = await drive_lap(client, clock)
         drives.stops += [reason.value for reason in lap.stops]
@@ -130,7 +130,7 @@ async def drive(client: TruckClient, clock: Clock, drives: "Drives", *, laps: bo
 
 @dataclass
 class Drives:
-    """What the gate said of the truck's driving."""
+    """States of the gate during the drives."""
 
     states: list[tuple[int, bool]] = field(default_factory=list)
     """When, and whether the truck drove."""
@@ -138,7 +138,7 @@ class Drives:
     """Why it had to be armed again."""
 
     async def watch(self, client: TruckClient) -> None:
-        """Note every state from the first drive on."""
+        """Record every state from the first drive on."""
         with client.subscribe(topics.GATE, fifo(256)) as gate:
             while True:
                 state = await gate.next()
@@ -149,7 +149,7 @@ class Drives:
         """Return the share of the time between two instants in which the truck drove.
 
         Raises:
-            SystemExit: it hardly did, so there is nothing to measure.
+            SystemExit: it hardly drove, so there is nothing to measure.
         """
         drove = [driving for at, driving in self.states if begin <= at < end]
         share = sum(drove) / max(len(drove), 1)
@@ -171,7 +171,7 @@ async def wander(client: TruckClient, clock: Clock) -> None:
 
 
 async def explore(client: TruckClient, clock: Clock) -> None:
-    """Have the truck explore; again where that is refused or has ended."""
+    """Explore repeatedly; retry after a refusal."""
     with client.subscribe(topics.EXPLORE, latest()) as states:
         while True:
             if states.latest is None or not states.latest.running:
@@ -185,7 +185,7 @@ SENT = {"planning": wander, "exploring": explore}
 
 
 async def daemon_round(clock: Clock, config: Path, endpoint: str, seconds: float, added: str | None) -> dict[str, Any]:
-    """Figures of one run of the daemon."""
+    """Return the figures of one run of the daemon."""
     report = config.with_name("report.json")
     async with process(str(HERE / "loop_watched.py"), "daemon", str(config), str(report)) as daemon:  # noqa: SIM117
         async with await connect(clock, "truck", endpoint) as client, process("-c", SUBSCRIBER, endpoint) as subscriber:
@@ -234,7 +234,7 @@ async def daemon_round(clock: Clock, config: Path, endpoint: str, seconds: float
 
 
 async def empty_round(config: Path, seconds: float) -> np.ndarray:
-    """Lateness of an empty loop, ms."""
+    """Return the lateness of an empty loop, ms."""
     report = config.with_name("empty.json")
     async with process(str(HERE / "loop_watched.py"), "empty", str(report), str(seconds)) as running:
         await running.wait()
@@ -242,7 +242,7 @@ async def empty_round(config: Path, seconds: float) -> np.ndarray:
 
 
 def _used(pid: int) -> float:
-    """Processor seconds of another process, by the clock clock_getcpuclockid(3) gives."""
+    """Return the processor time (s) of another process, by the clock of clock_getcpuclockid(3)."""
     return time.clock_gettime((~pid << 3) | 2)
 
 
@@ -253,7 +253,7 @@ def _memory(pid: int) -> dict[str, float]:
 
 
 async def compare(clock: Clock, rounds: int, seconds: float, added: str | None) -> dict[str, Any]:
-    """All rounds."""
+    """Run all rounds."""
     floor: list[np.ndarray] = []
     runs: list[dict[str, Any]] = []
     with TemporaryDirectory() as folder:
@@ -275,7 +275,7 @@ async def compare(clock: Clock, rounds: int, seconds: float, added: str | None) 
 
 
 def figures(floor: list[np.ndarray], runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Medians of the rounds; callbacks of all of them."""
+    """Return the medians of the rounds, and the callbacks of all of them."""
 
     def median(values: list[float]) -> float:
         return float(np.median(values))

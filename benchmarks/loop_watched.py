@@ -30,19 +30,19 @@ MEASURED = {"add_reader": 1, "call_soon": 0, "call_soon_threadsafe": 0, "call_la
 
 
 class WatchedLoop(uvloop.Loop):
-    """Event loop that measures its callbacks once ``watch`` is called, and until then is as fast as ever."""
+    """Event loop that measures its callbacks once ``watch`` is called, without cost before."""
 
     def __init__(self) -> None:
         super().__init__()
         self._readers: dict[int, tuple[Callable[..., Any], tuple[Any, ...]]] = {}
 
     def add_reader(self, fd: Any, callback: Callable[..., Any], *args: Any) -> None:
-        """As ever, but what is added now can be measured later."""
+        """Add a reader as usual, wrapped so that it can be measured later."""
         self._readers[fd] = (callback, args)
         super().add_reader(fd, callback, *args)
 
     def remove_reader(self, fd: Any) -> Any:
-        """As ever."""
+        """Remove a reader as usual."""
         self._readers.pop(fd, None)
         return super().remove_reader(fd)
 
@@ -59,7 +59,7 @@ class WatchedLoop(uvloop.Loop):
                 found.append((time.monotonic_ns(), used, _name(callback)))
 
         def through(method: Callable[..., Any], before: int) -> Callable[..., Any]:
-            """``method`` whose callback, behind so many other arguments, is measured; once, if it uses another one."""
+            """Return ``method`` with its callback, after ``before`` other arguments, measured once."""
 
             def call(*args: Any, **options: Any) -> Any:
                 if args[before] is measured:
@@ -75,7 +75,7 @@ class WatchedLoop(uvloop.Loop):
 
 
 def _name(callback: Any) -> str:
-    """The task's name and coroutine, or the function."""
+    """Return the task's name and coroutine, or the function."""
     task = getattr(callback, "__self__", None)
     if isinstance(task, asyncio.Task):
         return f"{task.get_name()}: {task.get_coro().__qualname__}"  # type: ignore[union-attr]
@@ -83,7 +83,7 @@ def _name(callback: Any) -> str:
 
 
 def watch_collector(report: dict[str, Any]) -> None:
-    """Measure every collection of garbage: generation and ms of processor time."""
+    """Measure every garbage collection: generation and ms of processor time."""
     found: list[tuple[int, float, int]] = report.setdefault("collections", [])
     begin = 0.0
 
@@ -98,7 +98,7 @@ def watch_collector(report: dict[str, Any]) -> None:
 
 
 def watch_ticks(report: dict[str, Any]) -> None:
-    """Note what the gate tells its meter."""
+    """Record the gate's reports to its meter."""
     ticks: list[tuple[int, float]] = report.setdefault("ticks", [])
     record = TickMeter.record
 
@@ -110,7 +110,7 @@ def watch_ticks(report: dict[str, Any]) -> None:
 
 
 async def empty(clock: WallClock, report: dict[str, Any], seconds: float) -> None:
-    """The floor: the gate's way of waiting for its ticks, and no work."""
+    """Measure the floor: ticks awaited like the gate's, without work."""
     schedule = Schedule(clock, RATE)
     ticks = report.setdefault("ticks", [])
     for _ in range(round(seconds * RATE)):
@@ -120,7 +120,7 @@ async def empty(clock: WallClock, report: dict[str, Any], seconds: float) -> Non
 
 
 def main() -> None:
-    """Run what the arguments say, then write the report."""
+    """Run the given process, then write the report."""
     report: dict[str, Any] = {"callbacks": []}
     if sys.argv[1] == "empty":
         target = Path(sys.argv[2])

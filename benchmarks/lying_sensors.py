@@ -71,7 +71,7 @@ Lie = Callable[[SimContext], None]
 
 
 def falsified(role: str, *faults: tuple[str, ...]) -> Lie:
-    """A lie of signals of an emulated device: (signal, fault, argument) each."""
+    """Return faults of signals of an emulated device: (signal, fault, argument) each."""
 
     def start(context: SimContext) -> None:
         for signal, fault, *values in faults:
@@ -81,12 +81,12 @@ def falsified(role: str, *faults: tuple[str, ...]) -> Lie:
 
 
 def commanded(role: str, line: str) -> Lie:
-    """A lie that an emulator's own console knows."""
+    """Return a fault given by a command of the emulator's console."""
     return lambda context: context.command(role, line)
 
 
 class Drive(StrEnum):
-    """How the truck drives."""
+    """Kind of drive of the truck."""
 
     HAND = "hand"
     """Straight ahead, by an operator."""
@@ -100,7 +100,7 @@ class Drive(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One way to lie."""
+    """A kind of fault."""
 
     start: Lie | None = None
     overlay: dict[str, Any] | None = None
@@ -134,7 +134,7 @@ HOME: Final = {Drive.LAP: "loop", Drive.SLAM: "loop", Drive.GOAL: "rooms"}
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """One trial."""
+    """Result of one trial."""
 
     contact: bool
     noticed: float | None
@@ -145,7 +145,7 @@ class Outcome:
 
 
 def trial(case: Case, world: str, seed: int) -> Outcome:
-    """Drive towards a post, or along the lap, with a sensor that lies."""
+    """Drive towards a post, or along the lap, with a faulty sensor."""
     rng = np.random.default_rng(seed)
     name = "slam.yaml" if case.drive is Drive.SLAM else "demo.yaml" if world == "loop" else "goals.yaml"
     config = load_config(CONFIGS / name, SimulatedTruckConfig)[0]
@@ -172,7 +172,7 @@ def trial(case: Case, world: str, seed: int) -> Outcome:
 
 
 class _Driver:
-    """The operator of one trial, and its judge."""
+    """Operator and judge of one trial."""
 
     def __init__(self, rig: VirtualRig, clock: VirtualClock, case: Case, *, early: bool) -> None:
         self._rig, self._clock, self._case, self._early = rig, clock, case, early
@@ -182,7 +182,7 @@ class _Driver:
         self._gate = rig.bus.subscribe(topics.GATE, fifo(4096))
 
     async def run(self) -> Outcome:
-        """Arm, drive, watch."""
+        """Arm, drive, observe."""
         rig, clock = self._rig, self._clock
         async with rig.running():
             await clock.sleep(2.5)
@@ -217,7 +217,7 @@ class _Driver:
             place_obstacle(GAP)(self._context)
 
     async def _start(self) -> None:
-        """Ask for a goal 4 m ahead."""
+        """Request a goal 4 m ahead."""
         truth = self._rig.world.truth(self._clock.now())
         goal = {"x": truth.x + 4.0 * math.cos(truth.yaw), "y": truth.y + 4.0 * math.sin(truth.yaw), "yaw": truth.yaw}
         request = {**await self._operator.header(), "frame": "map", "goal": goal}
@@ -296,7 +296,7 @@ class Quiet:
 
 
 def quiet(name: str, seconds: float, overlay: dict[str, Any]) -> Quiet:
-    """Let a shipped configuration drive, without a fault."""
+    """Drive a shipped configuration without a fault."""
     config = load_config(CONFIGS / name, SimulatedTruckConfig)[0]
     config = with_overlay(with_overlay(config, {"recorder": None, "map": None}), overlay)
 
@@ -382,7 +382,7 @@ def recorded(path: Path) -> Recording:
 
 
 def replayed(log: Recording) -> tuple[list[str], float, float]:
-    """Alarms of a recorded log, its duration and how much of it was compared, s."""
+    """Return the alarms of a recorded log, its duration, and its compared time, s."""
     stamps = log.stamps - log.stamps[0] + 1.0
     longest = float(np.max(log.ranges[np.isfinite(log.ranges)]))
     monitor = ConsistencyMonitor(ConsistencyConfig(), {Measure.WHEELS: "drive", Measure.SCANS: "lidar"})
@@ -420,7 +420,7 @@ def _say(text: str) -> None:
 
 
 def lies(cases: list[str], worlds: list[str], seeds: int) -> dict[str, Any]:
-    """All trials; figures by case."""
+    """Run all trials; return figures by case."""
     figures: dict[str, Any] = {}
     for name in cases:
         case = CASES[name]
@@ -442,7 +442,7 @@ def lies(cases: list[str], worlds: list[str], seeds: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Run what was asked for."""
+    """Run the selected parts."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--case", action="append", choices=CASES)

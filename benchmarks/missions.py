@@ -25,7 +25,7 @@ GOALS = {"missions": 50, "different": 0}
 
 
 def main() -> int:
-    """Run all missions; 0 = all goals are met."""
+    """Run all missions; 0: all goals are met."""
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--missions", type=int, default=GOALS["missions"])
     options.add_argument("--seed", type=int, default=1)
@@ -49,7 +49,7 @@ def main() -> int:
 
 
 def drawn(rng: random.Random) -> tuple[str, Script, Outcome]:
-    """Return a mission that the robot accepts, what happens meanwhile, and how it has to go."""
+    """Return a mission accepted by the robot, the script of events, and the required outcome."""
     while True:
         text, plan = mission(rng), script(rng)
         if not dead_ends(read(text)):

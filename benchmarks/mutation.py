@@ -97,7 +97,7 @@ Judgement = tuple[Mutant, str, str]
 
 @dataclass(frozen=True)
 class Baseline:
-    """What the sound project's tests reach."""
+    """Lines reached by the tests of the unmodified project."""
 
     lines: dict[str, dict[int, list[str]]]
     """Tests by file and line."""
@@ -105,7 +105,7 @@ class Baseline:
     """Duration of every test."""
 
     def tests(self, mutant: Mutant, sources: dict[str, bytes]) -> tuple[list[str], bool]:
-        """Tests that reach a mutant's function, likely and quick ones first, and whether its line runs on import."""
+        """Return the tests that reach a mutant's function, likely ones first, and whether its line runs on import."""
         lines = self.lines[mutant.file]
         found = set(lines.get(mutant.line) or lines.get(mutant.statement) or ())
         likely = set(found)
@@ -122,7 +122,7 @@ class Baseline:
         return sorted(found, key=lambda test: (test not in likely, self.seconds[test], test)), on_import
 
     def first(self, tests: list[str], most: float) -> list[str]:
-        """As many of the tests as take ``most`` seconds, at least one."""
+        """Return as many of the tests as take ``most`` seconds, at least one."""
         ends = np.cumsum([self.seconds[test] for test in tests])
         return tests[: max(int(np.searchsorted(ends, most)), 1)]
 
@@ -184,7 +184,7 @@ def baseline_of(folders: Iterable[str], scratch: Path) -> Baseline:
 
 
 def _digest_of(path: Path) -> str:
-    """Name of what a file of tests reaches: it follows from the tests, what they stand on, and the targets."""
+    """Return a name for the lines reached by a test file: it depends on the tests, their helpers, and the targets."""
     digest = hashlib.blake2s(digest_size=12)
     common = (other for other in path.parent.glob("*.py") if not other.name.startswith("test_"))
     for source in (path, *sorted(common), *sorted((ROOT / "tests").glob("*.py")), *(ROOT / file for file in TARGETS)):
@@ -193,7 +193,7 @@ def _digest_of(path: Path) -> str:
 
 
 def _of_file(found: dict[str, dict[str, Any]], file: str) -> dict[str, Any]:
-    """The share of one file of tests; what runs on import belongs to all of them."""
+    """Return the share of one test file; lines that run on import belong to all of them."""
     lines = {
         target: {line: [t for t in tests if not t or t.startswith(f"{file}::")] for line, tests in by_line.items()}
         for target, by_line in found["lines"].items()
@@ -205,7 +205,7 @@ def _of_file(found: dict[str, dict[str, Any]], file: str) -> dict[str, Any]:
 
 
 def _measured(out: Path, tests: Iterable[Path]) -> dict[str, dict[str, Any]]:
-    """Run files of tests once: lines by target with the tests that reach them, and the seconds of every test."""
+    """Run test files once; return lines by target with the tests that reach them, and the seconds of every test."""
     files = [str(ROOT / file) for file in TARGETS]
     subprocess.run(
         [sys.executable, "-c", MEASURE, str(out), json.dumps(files), json.dumps([*OPTIONS, *map(str, tests)])],
@@ -225,7 +225,7 @@ def _measured(out: Path, tests: Iterable[Path]) -> dict[str, dict[str, Any]]:
 
 
 def interval(killed: int, total: int) -> tuple[float, float]:
-    """95 % interval of a share, by Wilson."""
+    """Return the 95 % interval of a share (Wilson)."""
     if total == 0:
         return 0.0, 1.0
     z, share = 1.96, killed / total
@@ -235,21 +235,21 @@ def interval(killed: int, total: int) -> tuple[float, float]:
 
 
 def digest(source: bytes, mutant: Mutant) -> str:
-    """Name of a mutant of this very source."""
+    """Return a name for a mutant of exactly this source."""
     return hashlib.blake2s(source + repr((mutant.span, mutant.after)).encode(), digest_size=10).hexdigest()
 
 
 def known(file: Path, *, again: bool) -> dict[str, dict[str, str]]:
-    """Verdicts of earlier runs; with ``again`` without the survivors."""
+    """Return the verdicts of earlier runs; with ``again`` without the survivors."""
     lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
     verdicts = {entry["id"]: entry for entry in map(json.loads, lines)}
     return {name: entry for name, entry in verdicts.items() if not (again and entry["verdict"] in (SURVIVED, NO_TEST))}
 
 
 def sample(every: list[Mutant], count: int, seed: int) -> list[Mutant]:
-    """So many of them, drawn with a seed, in the order drawn; all of them for 0.
+    """Draw this many mutants with a seed, in the order drawn; 0: all of them.
 
-    The place of a mutant follows from itself: an edit elsewhere leaves it in the sample.
+    The position of a mutant depends only on itself: an edit elsewhere leaves it in the sample.
     """
     seen: Counter[str] = Counter()
 
@@ -263,7 +263,7 @@ def sample(every: list[Mutant], count: int, seed: int) -> list[Mutant]:
 def judged(
     todo: list[Mutant], sources: dict[str, bytes], options: argparse.Namespace, scratch: Path
 ) -> Iterator[Judgement]:
-    """Verdict of every mutant that the time allows, and the test that found it."""
+    """Yield the verdict of every mutant that the time allows, and the test that killed it."""
     end = time.monotonic() + 60 * options.minutes
     tests = sorted({test for mutant in todo for test in TARGETS[mutant.file]})
     baseline = baseline_of(tests, scratch)
@@ -315,7 +315,7 @@ def judged(
 def _until(
     end: float, pool: Executor, judge: Callable[[Mutant], Judgement], todo: Iterable[Mutant], jobs: int
 ) -> Iterator[Judgement]:
-    """Judgements begun before ``end``, as they come."""
+    """Yield judgements started before ``end``, as they are completed."""
     waiting = iter(todo)
     running = {pool.submit(judge, mutant) for mutant in islice(waiting, jobs)}
     while running:
@@ -327,7 +327,7 @@ def _until(
 
 
 def _check(pair: dict[str, Server], baseline: Baseline, sources: dict[str, bytes]) -> None:
-    """A server must find nothing wrong with a sound source."""
+    """Check that a server finds no fault in an unmodified source."""
     file, source = next(iter(sources.items()))
     test = next(test for test in baseline.seconds if test.startswith(TARGETS[file]))
     for kind, server in pair.items():
@@ -336,7 +336,7 @@ def _check(pair: dict[str, Server], baseline: Baseline, sources: dict[str, bytes
 
 
 def main() -> int:
-    """Judge the mutants; 0 = goal met."""
+    """Judge the mutants; 0: the goal is met."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sample", type=int, default=600, help="mutants drawn; 0 = all")
     parser.add_argument("--seed", type=int, default=1)
@@ -373,7 +373,7 @@ def main() -> int:
 
 
 def report(verdicts: dict[Mutant, str], total: int, equivalent: int) -> int:
-    """Print survivors, the score of every operator and the sums; 0 = goal met."""
+    """Print survivors, the score of every operator and the sums; 0: the goal is met."""
     for mutant, verdict in verdicts.items():
         if verdict in (SURVIVED, NO_TEST):
             print(

@@ -221,7 +221,7 @@ def run(first: int, count: int, seed: int, work: Path) -> dict[str, Any]:
 
 
 def _made(kind: Kind, folder: Path) -> dict[str, bytes]:
-    """Return intact files of a kind by place in ``folder``, which is empty before and after; they have been read once."""
+    """Return intact files of a kind by place in ``folder``, which is empty before and after; each was read once."""
     kind.make(folder)
     files = (file for file in folder.rglob("*") if file.is_file() and not file.is_symlink())
     sound = {str(file.relative_to(folder)): file.read_bytes() for file in files}

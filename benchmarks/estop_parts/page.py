@@ -1,15 +1,15 @@
-"""From a hand on the page to the bytes on the wires, in a real browser, with SLAM and the recorder running.
+"""Time from an operator's action on the page to the bytes on the wires, in a real browser, with SLAM and the recorder.
 
-Emulated truck, its daemon pinned to one core; world, emulators, station, browser on the other. The page drives to and
-fro with the keyboard. Instants of clicks and heartbeats are the browser's own, brought to this computer's monotonic
-clock by the quickest of many round trips, so that delays are never stated too short.
+The daemon of the emulated truck is pinned to one core; world, emulators, station and browser share the other. The page
+drives to and fro by keyboard. Times of clicks and heartbeats are the browser's own, converted to this computer's
+monotonic clock by the fastest of many round trips, so that delays are never understated.
 
     click     click on the emergency stop to the first quick stop on the drive controller's wire
     drive     a heartbeat with the opposite speed to the first bytes that change the motor's target
     steering  a heartbeat with the opposite steering to the first bytes that change a servo's target
     freeze    last heartbeat before SIGSTOP of the whole browser to the first bytes that stop the motor
 
-A command counts only where the wire was steady before it.
+A command counts only if the wire was steady before it.
 """
 
 import asyncio
@@ -68,7 +68,7 @@ addEventListener("pointerdown", (event) => event.target.closest("#estop") && cli
 
 
 class WirePort(PtyPort):
-    """Prints what reaches drive and servos: ``wire NAME INSTANT VALUE``, ns; a stop's value is ``stop``."""
+    """Prints the bytes that reach drive and servos: ``wire NAME INSTANT VALUE``, ns; a stop's value is ``stop``."""
 
     def __init__(self, link: Path) -> None:
         super().__init__(link)
@@ -99,13 +99,13 @@ class WirePort(PtyPort):
 
 
 def serve(config: Path) -> None:
-    """``monstertruckd simulate`` with taps on both wires."""
+    """Run ``monstertruckd simulate`` with taps on both wires."""
     simulate.PtyPort = WirePort  # type: ignore[attr-defined, misc]
     run_wall(lambda clock: simulate.serve(clock, (load_simulated(config),), on_stderr))
 
 
 class Wires:
-    """What changed on which wire, as the simulator prints it."""
+    """Changes on the wires, as printed by the simulator."""
 
     def __init__(self, stream: asyncio.StreamReader) -> None:
         self._stream = stream
@@ -131,7 +131,7 @@ class Wires:
                 self._last[name] = value
 
     async def first(self, found: list[int], since: int) -> int | None:
-        """The first of these from an instant on, waited for; None if there is none in time."""
+        """Wait for the first of these from an instant on; None if there is none in time."""
         end = time.monotonic() + WAIT
         while True:
             if after := [at for at in found if at >= since]:
@@ -145,7 +145,7 @@ class Wires:
 
 
 class Hand:
-    """The page's keyboard and mouse before a truck, and what the robot says."""
+    """The page's keyboard and mouse in front of a truck, and the robot's messages."""
 
     def __init__(self, page: Page, client: TruckClient, wires: Wires) -> None:
         self.page, self.client, self.wires = page, client, wires
@@ -155,7 +155,7 @@ class Hand:
         self._held: str | None = None
 
     async def synchronise(self) -> None:
-        """Bring the page's clock to ours; the instant before the quickest question is taken for that of its answer."""
+        """Map the page's clock to ours; the start of the fastest query is taken as the time of its answer."""
         best = SECOND
         for _ in range(50):
             before = time.monotonic_ns()
@@ -164,11 +164,11 @@ class Hand:
                 best, self._offset = trip, before - round(1e6 * now)
 
     def instant(self, milliseconds: float) -> int:
-        """The page's time on our clock, ns."""
+        """Convert the page's time to our clock, ns."""
         return self._offset + round(1e6 * milliseconds)
 
     async def hold(self, key: str | None) -> None:
-        """Hold this key and no other."""
+        """Hold only this key."""
         if self._held is not None:
             await self.page.keyboard.up(self._held)
         if key is not None:
@@ -176,7 +176,7 @@ class Hand:
         self._held = key
 
     async def drive(self, key: str, moves: Callable[[], bool]) -> None:
-        """Arm and hold a key until the truck does what it should; again where a busy computer has disarmed it."""
+        """Arm and hold a key until the truck reacts; repeat if a busy computer has disarmed it."""
         async with asyncio.timeout(ORDER_TIMEOUT):
             while not moves():
                 if self.gate.latest is None or not self.gate.latest.mode.accepts_motion:
@@ -187,16 +187,16 @@ class Hand:
                 await asyncio.sleep(0.02)
 
     def goes(self, forward: bool) -> bool:
-        """Whether it drives that way."""
+        """Whether it drives in that direction."""
         speed = self.odometry.latest.twist.vx if self.odometry.latest else 0.0
         return (speed if forward else -speed) > 0.05
 
     def driven(self) -> bool:
-        """Whether the page drives."""
+        """Whether the page drives it."""
         return self.gate.latest is not None and self.gate.latest.mode is GateMode.DRIVING
 
     async def click(self, forward: bool, more: float) -> float | None:
-        """Drive and click on the emergency stop; seconds, None if it is missed."""
+        """Drive and click on the emergency stop; return the seconds, None if it is missed."""
         await self.drive("w" if forward else "s", lambda: self.goes(forward))
         await asyncio.sleep(more)
         await self.page.mouse.down()
@@ -208,7 +208,7 @@ class Hand:
         return None if at is None else (at - clicked) / SECOND
 
     async def turn_round(self, wire: str, keys: tuple[str, str], more: float) -> float | None:
-        """Hold one key, then the other; seconds from the first heartbeat that says so, None if it was not steady."""
+        """Hold one key, then the other; return the seconds from the first heartbeat with the new value, or None."""
         field = 1 if wire == "drive" else 2
         await self.drive(keys[0], self.driven)
         await asyncio.sleep(HELD + more)
@@ -226,7 +226,7 @@ class Hand:
         return (at - said) / SECOND if at is not None and steady else None
 
     async def freeze(self, forward: bool, pids: list[int]) -> float | None:
-        """Stop the browser's processes while it drives; seconds from the last heartbeat to the bytes that stop it."""
+        """Stop the browser while it drives; return the seconds from the last heartbeat to the stopping bytes."""
         await self.drive("w" if forward else "s", lambda: self.goes(forward))
         await asyncio.sleep(HELD)
         if not self.driven():
@@ -250,12 +250,12 @@ class Hand:
 
 
 async def measure(clock: Clock, folder: Path, count: int) -> dict[str, dict[str, Any]]:
-    """So many trials of each; a tenth of them of freezing, which takes long.
+    """Run this many trials of each kind; a tenth of them of freezing, which takes long.
 
     Args:
-        clock: time.
-        folder: for files.
-        count: of trials.
+        clock: source of time.
+        folder: folder for files.
+        count: number of trials.
     """
     endpoint = free_endpoint()
     config = write_overlay(ROOT / "configs" / "slam.yaml", folder, endpoint)
@@ -312,7 +312,7 @@ async def measure(clock: Clock, folder: Path, count: int) -> dict[str, dict[str,
 
 
 def summary(values: list[float | None]) -> dict[str, Any]:
-    """Summarise delays in seconds; None: the event did not come, or is excluded."""
+    """Summarise delays in seconds; None: the event did not occur, or is excluded."""
     known = [1e3 * value for value in values if value is not None]
     p50, p99, most = np.percentile(known, (50, 99, 100)).tolist() if known else (np.inf, np.inf, np.inf)
     figures = {"p50_ms": round(p50, 1), "p99_ms": round(p99, 1), "max_ms": round(most, 1)}
@@ -320,7 +320,7 @@ def summary(values: list[float | None]) -> dict[str, Any]:
 
 
 def met(figures: dict[str, dict[str, Any]]) -> bool:
-    """Whether all goals are."""
+    """Whether all goals are met."""
     return (
         figures["click"]["without"] == 0
         and figures["click"]["p99_ms"] <= GOALS["click_p99_ms"]
@@ -332,7 +332,7 @@ def met(figures: dict[str, dict[str, Any]]) -> bool:
 
 
 def browser_processes() -> list[int]:
-    """All of the browser that this process started."""
+    """Return all processes of the browser started by this process."""
     parents = {}
     for folder in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):

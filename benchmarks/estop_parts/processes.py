@@ -21,13 +21,13 @@ ORDER_TIMEOUT = 40.0
 
 
 def on_stderr(line: str) -> None:
-    """Print a line of the simulator where nothing that a benchmark reads is printed."""
+    """Print a line of the simulator to standard error, which benchmarks do not read."""
     print(line, file=sys.stderr, flush=True)
 
 
 @asynccontextmanager
 async def process(core: int | None, output: Path, *arguments: str) -> AsyncIterator[asyncio.subprocess.Process]:
-    """A Python process while the context lasts; on one core, if one is named."""
+    """Run a Python process for the duration of the context, on one core if given."""
     pipe = asyncio.subprocess.PIPE
     with output.open("ab") as errors:
         running = await asyncio.create_subprocess_exec(
@@ -44,10 +44,10 @@ async def process(core: int | None, output: Path, *arguments: str) -> AsyncItera
 
 
 async def order(client: TruckClient, what: Order) -> None:
-    """Give an order until it is carried out; no tracker drives.
+    """Send an order until it is carried out; no tracker drives.
 
     Raises:
-        TruckError, TimeoutError: why it was not carried out in the end.
+        TruckError, TimeoutError: it was not carried out.
     """
     end = time.monotonic() + ORDER_TIMEOUT
     while True:
@@ -62,30 +62,30 @@ async def order(client: TruckClient, what: Order) -> None:
 
 
 class OtherLoad:
-    """Processor time that the cores of this process have given to others, but for its children, since it was made.
+    """Processor time used by other programs on the cores of this process since its creation, without its children.
 
-    Latencies of milliseconds are those of a quiet computer only: somebody else's turn on a core takes as long.
+    Latencies of milliseconds are only valid on a quiet computer: another program's time slice takes as long.
     """
 
     def __init__(self) -> None:
         self._began, self._busy, self._own = time.monotonic(), _busy(), _own()
 
     def cores(self) -> float:
-        """How many cores were busy with it, on the average; children count once they have ended."""
+        """Return the mean number of cores used by other programs; children count once they have ended."""
         others = (_busy() - self._busy) - (_own() - self._own)
         return max(0.0, others) / (time.monotonic() - self._began)
 
 
 def processor_seconds(pid: int) -> float:
-    """Processor time of a process of ours so far, s (proc(5))."""
+    """Return the processor time of a process so far, s (proc(5))."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def set_scheduler(pid: int, policy: int) -> None:
-    """Give all threads of a process of ours a scheduling policy (sched(7)); those that have ended are left out.
+    """Set the scheduling policy of all threads of a process (sched(7)); threads that have ended are skipped.
 
-    Only root may take ``SCHED_IDLE`` back; others' processes keep it.
+    Only root may revoke ``SCHED_IDLE``; other users' processes keep it.
     """
     for task in Path(f"/proc/{pid}/task").iterdir():
         with suppress(ProcessLookupError, PermissionError):
@@ -93,7 +93,7 @@ def set_scheduler(pid: int, policy: int) -> None:
 
 
 def _busy() -> float:
-    """Seconds for which the cores of this process have not been idle (proc(5), ``/proc/stat``)."""
+    """Return the seconds for which the cores of this process have not been idle (proc(5), ``/proc/stat``)."""
     cores = {f"cpu{core}" for core in os.sched_getaffinity(0)}
     rows = (line.split() for line in Path("/proc/stat").read_text().splitlines())
     ticks = sum(sum(map(int, row[1:4])) + sum(map(int, row[6:9])) for row in rows if row[0] in cores)

@@ -1,4 +1,4 @@
-"""Worlds to explore: what blocks, what can be reached, where runs start."""
+"""Worlds to explore: obstacles, reachable area, starts of runs."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +23,7 @@ MOUNT = (0.14, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Arena:
-    """A world as it really is; what is not free blocks."""
+    """A true world; every cell that is not free is an obstacle."""
 
     name: str
     resolution: float
@@ -40,14 +40,14 @@ class Arena:
 
     @classmethod
     def of(cls, name: str, cells: NDArray[np.bool_], resolution: float, corner: tuple[float, float]) -> "Arena":
-        """Create from blocked cells, shape (rows, columns); ``corner`` is the corner of the first one, m."""
+        """Create from occupied cells, shape (rows, columns); ``corner`` is the corner of the first one, m."""
         blocked = np.pad(cells, 1, constant_values=True)  # nothing is seen beyond the edge
         origin = corner[0] - resolution, corner[1] - resolution
         field = DistanceField(blocked, resolution, (*origin, 0.0))
         return cls(name, resolution, origin, blocked, clearance(blocked), field)
 
     def start(self, seed: int) -> Pose2:
-        """A random pose with room around in the largest part that the robot can drive in."""
+        """Return a random pose with free space around it, in the largest drivable part."""
         regions, _ = label(self._open())
         sizes = np.bincount(regions.ravel())
         sizes[0] = 0
@@ -61,7 +61,7 @@ class Arena:
                 return float(x), float(y), float(pose[0, 2])
 
     def reachable(self, start: Pose2) -> tuple[Array, Array]:
-        """Middles of the cells that the footprint can cover, x and y, m: flood-filled by the inscribed circle."""
+        """Return the centres of the cells that the footprint can cover (m), by flood fill of the inscribed circle."""
         regions, _ = label(self._open())
         row, column = (
             int((v - o) / self.resolution) for v, o in ((start[1], self.origin[1]), (start[0], self.origin[0]))
@@ -76,7 +76,7 @@ class Arena:
         return away
 
     def scan(self, pose: Pose2, reach: float, rng: np.random.Generator) -> tuple[Array, Array, Array]:
-        """Sensor (2,), returns (n, 2) and ends of beams that met nothing (k, 2), all in map, with the maker's noise."""
+        """Return sensor (2,), returns (n, 2), and ends of beams without return (k, 2), in map, with noise."""
         c, s = np.cos(pose[2]), np.sin(pose[2])
         sensor = np.array((pose[0] + c * MOUNT[0], pose[1] + s * MOUNT[0]))
         angles: Array = pose[2] + FIRST + STEP * np.arange(BEAMS)

@@ -1,7 +1,7 @@
-"""The whole daemon explores a world on the virtual clock, drives home and saves its map; devices are the emulated ones.
+"""The whole daemon explores a world on the virtual clock, drives home and saves its map, with emulated devices.
 
-Metres are those really driven, known is what the published map knows of the area that the footprint can cover, at home
-is where the truck really stands. Explorer, planner and tracker run in the loop, the mapper in its worker.
+Metres are truly driven; the known area is the part of the coverable area in the published map; the final position is
+the truck's true one. Explorer, planner and tracker run in the loop, the mapper in its worker.
 """
 
 import asyncio
@@ -48,7 +48,7 @@ Happen = Callable[["ExploringTruck"], Awaitable[None]]
 
 @dataclass
 class RunRecord:
-    """What became of one exploration."""
+    """Record of one exploration."""
 
     state: ExplorationState
     late: bool
@@ -68,12 +68,12 @@ class RunRecord:
 
 
 class ExploringTruck:
-    """A truck that explores.
+    """An exploring truck.
 
     Args:
         rig: the truck.
         arena: the world.
-        start: of the truck.
+        start: start pose.
     """
 
     def __init__(self, rig: VirtualRig, arena: Arena, start: Pose2) -> None:
@@ -90,12 +90,12 @@ class ExploringTruck:
 
     @property
     def here(self) -> Pose2:
-        """Where the truck really is."""
+        """True pose of the truck."""
         truth = self.rig.world.truth(self.clock.now())
         return truth.x, truth.y, truth.yaw
 
     async def explore(self, budget: float, limit: float, happen: Happen | None) -> dict[str, Any]:
-        """From arming to the end of the exploration."""
+        """Run from arming to the end of the exploration."""
         await self.operator.arm()
         order = {"order": ExploreOrder.START, "home": True, "budget": budget}
         await self.operator.call("explore", {**await self.operator.header(), **order})
@@ -135,16 +135,16 @@ def recorded_run(
     limit: float = LIMIT,
     **more: Any,
 ) -> RunRecord:
-    """One exploration of a world of this repository; it starts where the light harness does.
+    """Run one exploration of a world of this repository; it starts as in the light harness.
 
     Args:
-        world: name.
-        seed: of start and noise.
-        happen: what happens meanwhile.
-        reach: of the lidar, m; mapper and explorer count on it.
-        budget: seconds of exploring.
-        limit: seconds until the end.
-        more: of the configuration's `sim.world`.
+        world: name of the world.
+        seed: seed of start and noise.
+        happen: event during the run.
+        reach: range of the lidar, m; known to mapper and explorer.
+        budget: time limit of the exploration, s.
+        limit: time limit of the run, s.
+        more: further settings of `sim.world`.
     """
     file = CONFIGS / "worlds" / f"{world}.yaml"
     arena = Arena.load(world, file)
@@ -176,7 +176,7 @@ def recorded_run(
 
 
 def explored(world: str, seed: int, reach: float) -> dict[str, Any]:
-    """One run, judged."""
+    """Run and judge one exploration."""
     run = recorded_run(world, seed, reach=reach)
     metres, covered = known(run)
     here = run.true[-1, 1:3]
@@ -191,12 +191,12 @@ def explored(world: str, seed: int, reach: float) -> dict[str, Any]:
 
 
 def driven(true: Array) -> Array:
-    """Metres at each sample."""
+    """Return the distance travelled at each sample, m."""
     return np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(true[:, 1:3], axis=0).T))))
 
 
 def known(run: RunRecord) -> tuple[dict[float, float], float]:
-    """Metres at which each share of what can be reached was known, and the share at the end."""
+    """Return the distance (m) at which each share of the reachable area was known, and the final share."""
     x, y = run.truck.arena.reachable(run.start)
     rest = np.column_stack((x, y))
     count, way, share = len(rest), driven(run.true), 0.0
@@ -221,7 +221,7 @@ def known(run: RunRecord) -> tuple[dict[float, float], float]:
 
 
 def off_share(folder: Path, arena: Arena, added: list[Box]) -> float:
-    """Share of the saved map's walls that are more than ``OFF`` from true ones and from what was put there."""
+    """Return the share of the saved map's walls that are more than ``OFF`` from the true walls and the added boxes."""
     saved = load(folder).grid
     blocked = arena.blocked.copy()
     origin = np.array(arena.origin)
@@ -238,7 +238,7 @@ def off_share(folder: Path, arena: Arena, added: list[Box]) -> float:
 
 
 def summary(rows: list[dict[str, Any]]) -> tuple[dict[str, float], dict[str, float]]:
-    """Means of each world and range, and what is not to be."""
+    """Return the means of each world and range, and the violated goals."""
     figures: dict[str, float] = {"daemon_runs": float(len(rows))}
     for world, reach in sorted({(row["world"], row["reach"]) for row in rows}):
         of = [row for row in rows if (row["world"], row["reach"]) == (world, reach)]

@@ -1,13 +1,13 @@
 """Faults while the whole daemon explores the built-in rooms, on the virtual clock, drawn by seed.
 
-- ``kidnap``: it is carried off to another place, and armed again;
-- ``door``: the nearest door is shut, of every other seed for ``SHUT`` seconds, else for good;
-- ``person``: somebody walks about from the beginning, and stops or turns before the truck;
-- ``lidar``: its plug is out for ``UNPLUGGED`` seconds, then the truck is armed again;
-- ``battery``: it is changed for one nearly empty when the truck is ``FAR`` from its start, or after ``LATEST`` seconds.
+- ``kidnap``: the truck is carried to another place, and armed again;
+- ``door``: the nearest door is closed, for ``SHUT`` seconds with every other seed, otherwise permanently;
+- ``person``: a person walks about from the start, and stops or turns in front of the truck;
+- ``lidar``: the lidar is unplugged for ``UNPLUGGED`` seconds, then the truck is armed again;
+- ``battery``: replaced by a nearly empty one when the truck is ``FAR`` from its start, or after ``LATEST`` seconds.
 
 A run ends safely if it ends in time, touches nothing, and the truck stands. The map is doubled if more than ``DOUBLED``
-of its walls are more than 0.15 m from true ones (the door leaf counts as such). It says what it did if its end has a
+of its walls are more than 0.15 m from true ones (the door leaf counts as true). A run is explained if its end has a
 reason and a text, the map was saved by then, and a reason of the fault was reported.
 """
 
@@ -54,7 +54,7 @@ SAYS: Final = {
 
 
 def explored(seed: int, fault: str) -> dict[str, Any]:
-    """One run, judged."""
+    """Run and judge one exploration."""
     rng = np.random.default_rng([31, seed, FAULTS.index(fault)])
     people = [walker(seed, rng)] if fault == "person" else []
 
@@ -83,7 +83,7 @@ def explored(seed: int, fault: str) -> dict[str, Any]:
 
 
 def walker(seed: int, rng: np.random.Generator) -> dict[str, Any]:
-    """Settings of somebody who begins away from the truck."""
+    """Return the settings of a person who starts away from the truck."""
     start = Arena.load("rooms", CONFIGS / "worlds" / "rooms.yaml").start(seed)
     first = next(int(k) for k in rng.permutation(len(WALK)) if math.dist(WALK[k], start[:2]) > APART)
     places = [{"x": x, "y": y} for x, y in (*WALK[first:], *WALK[:first])]
@@ -91,12 +91,12 @@ def walker(seed: int, rng: np.random.Generator) -> dict[str, Any]:
 
 
 def noted(truck: ExploringTruck) -> None:
-    """The fault comes now."""
+    """Mark the time of the fault."""
     truck.at = truck.clock.now() / SECOND
 
 
 def carry_off(truck: ExploringTruck, rng: np.random.Generator) -> None:
-    """Somewhere else."""
+    """Carry the truck to another place."""
     arena = truck.arena
     low, size = np.array(arena.origin), np.array(arena.blocked.shape[::-1]) * arena.resolution
     while True:
@@ -110,7 +110,7 @@ def carry_off(truck: ExploringTruck, rng: np.random.Generator) -> None:
 
 
 async def shut_door(truck: ExploringTruck, *, opens: bool) -> None:
-    """The nearest one that the truck is not in."""
+    """Close the nearest door that the truck is not in."""
     while True:
         here = truck.here[:2]
         doors = sorted(DOORS, key=lambda door: math.dist(here, door[:2]))
@@ -129,7 +129,7 @@ async def shut_door(truck: ExploringTruck, *, opens: bool) -> None:
 
 
 async def arm_again(truck: ExploringTruck, after: float) -> None:
-    """As somebody does who put it right; again where it is refused."""
+    """Arm as an operator who has removed the cause; retry if refused."""
     for _ in range(10):
         await truck.clock.sleep(after)
         gate = truck.rig.bus.newest(topics.GATE)
@@ -142,7 +142,7 @@ async def arm_again(truck: ExploringTruck, after: float) -> None:
 
 
 def judged(run: RunRecord, fault: str, seed: int) -> dict[str, Any]:
-    """What is kept of a run."""
+    """Return the saved values of a run."""
     state, at = run.state, run.truck.at
     reasons = {event.reason for event in run.events if event.stamp / SECOND >= at}
     wanted, saved = SAYS.get(fault, set()), "map in" in state.text
@@ -158,7 +158,7 @@ def judged(run: RunRecord, fault: str, seed: int) -> dict[str, Any]:
 
 
 def summary(rows: list[dict[str, Any]]) -> tuple[dict[str, float], dict[str, float]]:
-    """Runs of each fault that did not end safely, with a doubled map, without a word; all should be none."""
+    """Return, for each fault, the runs with an unsafe end, a doubled map or no explanation; the goals are zero."""
     figures: dict[str, float] = {}
     goals: dict[str, float] = {}
     for fault in FAULTS:

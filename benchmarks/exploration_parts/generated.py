@@ -1,6 +1,6 @@
-"""Worlds that nobody has drawn, by number: offices, mazes and halls; the same number gives the same world.
+"""Generated worlds by number: offices, mazes and halls; the same number gives the same world.
 
-They show whether settings that were chosen in some worlds hold in others.
+They show whether settings chosen in some worlds are valid in others.
 """
 
 from collections.abc import Callable
@@ -20,7 +20,7 @@ Cells = NDArray[np.bool_]
 
 
 def generated(name: str) -> Arena | None:
-    """The world of a name like ``office3``; None = no such name."""
+    """Return the world of a name like ``office3``; None for other names."""
     kind = name.rstrip("0123456789")
     if kind not in KINDS or kind == name:
         return None
@@ -72,7 +72,7 @@ def _door(cells: Cells, row: int, rng: np.random.Generator) -> None:
 
 
 def _maze(rng: np.random.Generator) -> Cells:
-    """Corridors of one width on a lattice: a tree, and some walls less."""
+    """Corridors of one width on a lattice: a tree, with some further walls removed."""
     rows, columns = int(rng.integers(5, 9)), int(rng.integers(6, 12))
     pitch = _n(rng.uniform(1.2, 1.9))
     cells = np.ones((rows * pitch + 2, columns * pitch + 2), np.bool_)
@@ -97,7 +97,7 @@ def _maze(rng: np.random.Generator) -> Cells:
 
 
 def _join(cells: Cells, here: tuple[int, int], there: tuple[int, int], pitch: int) -> None:
-    """Free two places of the lattice and what lies between them; walls are 0.1 m thick."""
+    """Free two places of the lattice and the passage between them; walls are 0.1 m thick."""
     top, left = min(here[0], there[0]) * pitch + 2, min(here[1], there[1]) * pitch + 2
     bottom, right = (max(here[0], there[0]) + 1) * pitch, (max(here[1], there[1]) + 1) * pitch
     cells[top:bottom, left:right] = False
@@ -119,7 +119,7 @@ def _hall(rng: np.random.Generator) -> Cells:
 
 
 def _box(cells: Cells, rng: np.random.Generator, sizes: tuple[float, float]) -> None:
-    """Put a box anywhere, unless that would leave no way past it."""
+    """Put a box at a random place, unless it would block the passage."""
     high, wide = (_n(v) for v in rng.uniform(*sizes, 2))
     row, column = (int(rng.integers(1, max(n - 1, 2))) for n in cells.shape)
     room = _n(BODY.width + 0.3)
@@ -129,7 +129,7 @@ def _box(cells: Cells, rng: np.random.Generator, sizes: tuple[float, float]) -> 
 
 
 def _n(metres: float) -> int:
-    """Cells."""
+    """Convert metres to cells."""
     return round(metres / RESOLUTION)
 
 

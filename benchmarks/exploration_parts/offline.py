@@ -1,4 +1,4 @@
-"""A peer that knows the world: places from which all of it is seen, in a short tour, by the same routes and scans."""
+"""A peer that knows the world: viewpoints that cover all of it, in a short tour, with the same routes and scans."""
 
 import math
 
@@ -36,7 +36,7 @@ def _seen(cells, places, points, reach):  # type: ignore[no-untyped-def] # noqa:
 
 
 class KnownWorld(ExplorationView):
-    """The whole map, with the path lengths between its places."""
+    """The whole map, with the path lengths between places."""
 
     def path_lengths_between(self, places: list[tuple[float, float]]) -> np.ndarray:
         """Return the path lengths between all places (m), shape (n, n); inf if no path is known."""
@@ -52,7 +52,7 @@ class KnownWorld(ExplorationView):
 
 
 def offline_tour(arena: Arena, reach: float, seed: int) -> Run:
-    """Drive it; coverage is judged as that of the explorers, by what the robot's own scans show."""
+    """Drive the tour; coverage is judged as for the explorers, by the robot's own scans."""
     rover = Rover(arena, NearestConfig(reach=reach), seed)
     rover.run.kind = "offline"
     truth = np.where(arena.blocked, 100, 0).astype(np.int8)
@@ -100,7 +100,7 @@ def offline_tour(arena: Arena, reach: float, seed: int) -> Run:
 
 
 def _places(arena: Arena, view: ExplorationView) -> np.ndarray:
-    """Middles of cells on a coarse lattice that the robot can stand on."""
+    """Return the centres of cells on a coarse lattice where the robot can stand."""
     size = np.array(arena.blocked.shape[::-1]) * arena.resolution
     x, y = (np.arange(o + SPACING / 2, o + s, SPACING) for o, s in zip(arena.origin, size, strict=True))
     places = np.column_stack([v.ravel() for v in np.meshgrid(x, y)])
@@ -111,7 +111,7 @@ def _places(arena: Arena, view: ExplorationView) -> np.ndarray:
 
 
 def _cover(seen: np.ndarray) -> list[int]:
-    """Greedy: whichever place shows most that no other one shows."""
+    """Choose greedily the place that shows most of the area not yet seen."""
     left, chosen = np.ones(seen.shape[1], np.bool_), []
     while left.mean() > 1.0 - COVER:
         gain = (seen & left).sum(axis=1)
@@ -124,7 +124,7 @@ def _cover(seen: np.ndarray) -> list[int]:
 
 
 def _unknown(rover: Rover, points: np.ndarray) -> float:
-    """Share of points that the robot's map does not know."""
+    """Return the share of points that are unknown to the robot's map."""
     patch = rover.grid.patch()
     column, row = np.floor((points - patch.origin) / patch.resolution).astype(int).T
     rows, columns = patch.cells.shape
@@ -136,7 +136,7 @@ def _unknown(rover: Rover, points: np.ndarray) -> float:
 
 @njit(cache=True)
 def short_tour(distance: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Order of visiting n places on a short tour from the start, with a free end.
+    """Return the order of visiting n places on a short tour from the start, with a free end.
 
     The nearest-neighbour tour, improved by reversing and moving parts while that shortens it (2-opt, Or-opt;
     G. A. Croes 1958, I. Or 1976).

@@ -1,7 +1,7 @@
-"""Light harness: the real grid, exploring step and route planner; a robot that is where its route says.
+"""Light harness: the real grid, exploring step and route planner; the robot follows its route exactly.
 
 Scans are taken every ``SPACING`` metres and after every turn of ``TURN``, as the mapper integrates them; the pose is
-the true one. The decisions are those of the exploration service: asked for every ``DECIDE`` metres and at every end.
+the true one. Decisions are made as by the exploration service: every ``DECIDE`` metres and at every end.
 """
 
 import math
@@ -44,7 +44,7 @@ TRUCK = FourWheelSteering()
 
 @dataclass
 class Run:
-    """What became of one exploration."""
+    """Record of one exploration."""
 
     world: str
     kind: str
@@ -72,10 +72,10 @@ class Rover:
 
     Args:
         arena: the world.
-        config: of the explorer.
-        seed: of start and noise.
-        start: instead of the seed's.
-        steering: of the routes, 2ws or 4ws.
+        config: settings of the explorer.
+        seed: seed of start and noise.
+        start: start pose; default: the seed's.
+        steering: steering of the routes, 2ws or 4ws.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class Rover:
         return self.run.driven / SPEED
 
     def look(self) -> None:
-        """Take a scan, if the mapper would."""
+        """Take a scan if the mapper would."""
         pose, before = self.pose, self.scanned
         if before is not None and math.dist(before[:2], pose[:2]) < SPACING and abs(pose[2] - before[2]) < TURN:
             return
@@ -127,13 +127,13 @@ class Rover:
         self.grid.add(sensor, hits, np.vstack((passed, under)))
 
     def scan(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The lidar's place, where its beams ended, and those of the beams that met nothing."""
+        """Return the lidar's position, the ends of its beams, and the ends of beams without return."""
         sensor, self.hits, passed = self.arena.scan(self.pose, self.config.reach, self.rng)
         self.seen_from = self.pose
         return sensor, self.hits, passed
 
     def take_stock(self) -> None:
-        """Send the changes to the explorer, and see how much is known."""
+        """Send the changes to the explorer, and compute the known share."""
         tiles = tuple(grid_message(patch, 0, 0) for patch in self.grid.changes())
         for tile in tiles:
             one = time.process_time()
@@ -157,7 +157,7 @@ class Rover:
         self.map = grid_message(patch, 0, 0)
 
     def choose(self, current: Viewpoint | None, pursued: float) -> Viewpoint | None:
-        """Ask for a decision."""
+        """Request a decision."""
         begin = time.process_time()
         answer = self.exploring.step(
             ExploreTask(
@@ -173,7 +173,7 @@ class Rover:
         return answer.target
 
     def route(self, goal: Pose2, *, clear: bool = True) -> np.ndarray | None:
-        """Poses of a route."""
+        """Return the poses of a route."""
         if self.seen_from != self.pose:
             self.scan()
         for k in range(2):
@@ -187,7 +187,7 @@ class Rover:
         return None
 
     def drive(self, poses: np.ndarray, most: float) -> bool:
-        """Follow a route for so many metres; False if something stands on it."""
+        """Follow a route for at most this distance (m); return False if it is blocked."""
         travelled = 0.0
         for k in range(1, len(poses)):
             ahead = poses[k : k + round(AHEAD / 0.05)]
@@ -208,7 +208,7 @@ class Rover:
         return True
 
     def blocked(self, ahead: np.ndarray) -> bool:
-        """Whether ``SCANS`` scans in a row show something on the way, as the goal service asks for."""
+        """Whether ``SCANS`` consecutive scans show an obstacle on the route, as the goal service requires."""
         for _ in range(SCANS):
             if not path_blocked(BARE, ahead, points_relative(self.hits, self.pose), self.pose):
                 return False
@@ -216,7 +216,7 @@ class Rover:
         return True
 
     def explore(self) -> Run:
-        """Until nothing is left, then home."""
+        """Explore until nothing is left, then drive home."""
         begin = time.process_time()
         self.look()
         self.take_stock()
@@ -257,12 +257,12 @@ class Rover:
         return self.run
 
     def remember(self) -> None:
-        """Where it came from."""
+        """Store the current place for the way back."""
         if not self.trail or math.dist(self.trail[-1][:2], self.pose[:2]) >= TRAIL:
             self.trail = [*self.trail, self.pose][-REMEMBERED:]
 
     def back(self) -> bool:
-        """Drive back to where it came from, as ``exploration`` does; whether there is such a place."""
+        """Drive back to the previous place, as ``exploration`` does; return whether there is one."""
         self.trail = [pose for pose in self.trail if math.dist(pose[:2], self.pose[:2]) > TRAIL]
         if not self.trail:
             return False
@@ -275,7 +275,7 @@ class Rover:
         return True
 
     def fail(self, target: Viewpoint) -> None:
-        """Leave a place alone."""
+        """Exclude a viewpoint."""
         self.run.failures += 1
         if self.stuck > 0 and math.dist(self.stuck_at[:2], self.pose[:2]) < LEFT:
             self.stuck += 1
@@ -287,13 +287,13 @@ class Rover:
         self.unreached = self.unreached.failed(target.pose[:2], self.now)
 
     def arrived(self, target: Viewpoint) -> None:
-        """What is still to be seen from here was not seen: do not come again soon."""
+        """Exclude a viewpoint for a while: the rest of its view was not visible."""
         self.stuck = 0
         if not isinstance(self.config, AuthorConfig):
             self.attempts = self.attempts.failed(target.frontier, self.now)
 
     def go_home(self) -> None:
-        """Drive back."""
+        """Drive back to the start."""
         for _ in range(40):
             poses = self.route(self.home)
             if poses is None or self.drive(poses, math.inf):

@@ -1,4 +1,4 @@
-"""Scripted faults on the whole daemon while it drives: what each has to lead to, how it is run, and the judgement.
+"""Scripted faults on the whole daemon while it drives: execution, required reaction, judgement.
 
 Times come from three independent sources: the bytes on the drive controller's wire, the world's truth, and the
 messages on the bus.
@@ -59,10 +59,10 @@ COLUMNS: Final = ("fault", "detected", "stop bytes", "standstill", "metres", "re
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScenarioContext(SimContext):
-    """The simulated side, and what only scripted faults act on.
+    """The simulated side, and the targets of scripted faults only.
 
     Args:
-        bus: of the daemon, for bugs in its services.
+        bus: bus of the daemon, for bugs in its services.
         station: drives by requests.
         began: start of the world, ns.
     """
@@ -72,12 +72,12 @@ class ScenarioContext(SimContext):
     began: int
 
     def poison(self, topic: Topic[Any]) -> None:
-        """Give the readers of ``topic`` a message that none can understand, as a bug would."""
+        """Send the readers of ``topic`` an unreadable message, as a bug would."""
         self.bus.hand_over(topic, cast("Message", object()))
 
 
 class Expect(StrEnum):
-    """How the daemon has to react."""
+    """Required reaction of the daemon."""
 
     STOP = "stop"
     """The daemon stops the truck, in time."""
@@ -101,20 +101,20 @@ class Expect(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """One fault and what has to happen.
+    """A fault and the required reaction.
 
     Args:
-        fault: what goes wrong.
-        expect: how the daemon has to react.
-        seen: reasons that the gate's state or events must name, in this order; the last is the one that stops.
+        fault: the fault.
+        expect: required reaction of the daemon.
+        seen: reasons that the gate's state or events must name, in this order; the last one stops the truck.
         down: services that must be reported lost, and why.
-        lead: seconds until an operator tries to arm, where the truck stands at first.
-        device: the role whose samples are lost or spoilt.
-        recovers: afterwards the truck can be driven again.
-        resumes: the truck goes on by itself afterwards, by the gate's rule for short faults.
-        by_station: a station drives, not the tracker.
-        overlay: configuration it needs.
-        timeout: seconds in which the truck has to recover; a replugged device: 2 s.
+        lead: seconds until an operator tries to arm, if the truck stands at first.
+        device: role whose samples are lost or corrupted.
+        recovers: whether the truck can be driven again afterwards.
+        resumes: whether the truck continues by itself afterwards, by the gate's rule for short faults.
+        by_station: whether a station drives, instead of the tracker.
+        overlay: required configuration.
+        timeout: time limit of the recovery, s; 2 s for a replugged device.
     """
 
     fault: Fault[ScenarioContext]
@@ -137,7 +137,7 @@ class Scenario:
 
 @dataclass(frozen=True, slots=True)
 class Reaction:
-    """What happened; seconds count from the fault, ``recovered_after_s`` from its end. None: it did not happen."""
+    """Measured reaction; seconds count from the fault, ``recovered_after_s`` from its end. None: it did not occur."""
 
     fault: str
     detected_after_s: float | None = None
@@ -177,13 +177,13 @@ async def measure(
     """Run one scenario.
 
     Args:
-        scenario: what to do.
-        config: of the truck; recorder and map are left out unless the scenario's overlay has them.
-        clock: of the running virtual loop.
+        scenario: scenario to run.
+        config: configuration of the truck; recorder and map are left out unless the scenario's overlay has them.
+        clock: clock of the running virtual loop.
         driven: seconds at speed before the fault; shifts it against ticks and exchanges.
 
     Raises:
-        NoAnswerError: the truck did not drive in the first place.
+        NoAnswerError: the truck did not drive before the fault.
     """
     plain = with_overlay(config, {"recorder": None, "map": None})
     reaction = None
@@ -227,7 +227,7 @@ class _ScenarioRun:
         self.stands = scenario.expect is Expect.REFUSE
 
     async def run(self) -> Reaction:
-        """Drive, have the fault, end it, drive again."""
+        """Drive, cause the fault, end it, drive again."""
         scenario, fault = self.scenario, self.scenario.fault
         async with self._station():
             await self._require(self._drivable, "the truck to be ready")
@@ -254,7 +254,7 @@ class _ScenarioRun:
             return self._reaction(recovered_after_s=after, moved_by_itself=moved, drove_again=again)
 
     async def drive(self) -> None:
-        """Arm and come to speed.
+        """Arm and reach the speed.
 
         Raises:
             NoAnswerError: it takes too long.
@@ -325,7 +325,7 @@ class _ScenarioRun:
         return None if instant is None else (instant - self.started) / SECOND
 
     def _gate_stop(self, reports: Iterable[DaemonReport]) -> tuple[int, Reason | None] | None:
-        """When the gate stopped, and why; a limit of 0 is a stop too."""
+        """Return the time and reason of the gate's stop; a limit of 0 is a stop too."""
         for state in reports:
             if isinstance(state, GateState) and (state.mode is not GateMode.DRIVING or state.speed_limit == 0):
                 expected = [reason for reason in self.scenario.seen[-1:] if reason in state.reasons]
@@ -333,7 +333,7 @@ class _ScenarioRun:
         return None
 
     def _after_sample(self, instant: int | None) -> float | None:
-        """Seconds from the last good sample of the spoilt device to an instant."""
+        """Return the seconds from the last valid sample of the affected device to an instant."""
         if instant is None or self.samples is None:
             return None
         arrivals = [m.received for m in self.samples.drain() if m.received - m.stamp < 0.4 * SECOND]
@@ -346,7 +346,7 @@ def _unready(table: HealthTable) -> list[ServiceHealth]:
 
 
 def _down(reports: Iterable[DaemonReport]) -> dict[str, tuple[Reason, ...]]:
-    """Services that were lost, and why."""
+    """Return the lost services and the reasons."""
     down: dict[str, dict[Reason, None]] = {}
     for table in reports:
         for service in _unready(table) if isinstance(table, HealthTable) else ():
@@ -366,7 +366,7 @@ def _named(report: DaemonReport) -> tuple[Reason, ...]:
 
 
 def shortcomings(scenario: Scenario, reaction: Reaction) -> list[str]:
-    """Everything about a reaction that misses its goal; empty = all goals met."""
+    """Return all violated goals of a reaction; empty if all are met."""
     return [*_reaction(scenario, reaction), *_account(scenario, reaction), *_afterwards(scenario, reaction)]
 
 
@@ -414,7 +414,7 @@ def _late(seconds: float | None, limit: float, what: str) -> Iterator[str]:
 
 
 def _account(scenario: Scenario, got: Reaction) -> Iterator[str]:
-    """Reasons and services that were reported."""
+    """Yield the violations in reported reasons and services."""
     places = [got.seen.index(reason) if reason in got.seen else -1 for reason in scenario.seen]
     if -1 in places or places != sorted(places):
         yield f"reported {', '.join(got.seen)}: expected {', '.join(scenario.seen)}"
@@ -441,7 +441,7 @@ def _afterwards(scenario: Scenario, got: Reaction) -> Iterator[str]:
 
 
 def cells(scenario: Scenario, reaction: Reaction) -> tuple[str, ...]:
-    """One row of the table: seconds from the fault (``back``: from its end), metres."""
+    """Return one row of the table: seconds from the fault (``back``: from its end), metres."""
     reasons: list[str] = [*scenario.seen[-1:]] or sorted(set(scenario.down.values())) or [reaction.reason or "-"]
     return (
         reaction.fault,
@@ -455,7 +455,7 @@ def cells(scenario: Scenario, reaction: Reaction) -> tuple[str, ...]:
 
 
 def stop_bytes(tap: WireTap, since: int) -> int | None:
-    """Instant at which the first write that stops the motor has reached an EPOS: target 0, quick stop, halt, off."""
+    """Return the time when the first stopping write reached an EPOS: target 0, quick stop, halt, off."""
     for instant, index, value in written(tap, since):
         target = index == od.TARGET_VELOCITY.index and value == 0
         if target or (index == od.CONTROLWORD.index and value in STOP_CONTROLS):

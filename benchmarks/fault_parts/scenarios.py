@@ -51,7 +51,7 @@ def set_charge(share: float) -> Action[SimContext]:
 
 
 def station(*, silent: bool = False, speed: float = 0.18) -> Action[ScenarioContext]:
-    """What the station sends from then on."""
+    """Requests of the station from then on."""
 
     def act(context: ScenarioContext) -> None:
         context.station.silent, context.station.speed = silent, speed
@@ -60,14 +60,14 @@ def station(*, silent: bool = False, speed: float = 0.18) -> Action[ScenarioCont
 
 
 def tilt(context: ScenarioContext) -> None:
-    """Nose up within two seconds, beyond the limit."""
+    """Tilt the nose up within two seconds, beyond the limit."""
     now = context.clock.now()
     frequency = 0.5 / ((now - context.began) / SECOND)  # so that the sinusoid crosses zero now, downwards
     context.robot.world.set_tilt(now, SinusoidTilt(kind="sinusoid", pitch_deg=45.0, frequency=frequency))
 
 
 def level(context: SimContext) -> None:
-    """Back on level ground."""
+    """Return to level ground."""
     context.robot.world.set_tilt(context.clock.now(), GroundTilt())
 
 
@@ -86,7 +86,7 @@ def noise(role: str) -> Scenario:
 
 
 def of_device(role: str) -> Iterator[Scenario]:
-    """What can happen to any device's cable."""
+    """Faults of any device's cable."""
     stop = WITHOUT_LINE[role]
     stale = (STALE[role],)
     lost = {role: Reason.DEVICE_LOST}
@@ -113,7 +113,7 @@ def of_device(role: str) -> Iterator[Scenario]:
 
 
 def with_line() -> Iterator[Scenario]:
-    """The deadman line is wired: the drive's link is lost, or the line itself falls."""
+    """Faults with a deadman line: the drive's link is lost, or the line itself falls."""
     for name, broken, mended in (
         ("unplugged", "unplug", "plug"),
         ("stalled", "line stalled on", "line stalled off"),
@@ -135,7 +135,7 @@ def with_line() -> Iterator[Scenario]:
 
 
 def wrong_devices() -> Iterator[Scenario]:
-    """Two cables exchanged while the truck stands."""
+    """Exchange two cables while the truck stands."""
     wrong, silent = Reason.DEVICE_WRONG, Reason.DEVICE_TIMEOUT  # a servo controller says nothing to strange questions
     for one, other, reasons in (
         (DeviceRole.LIDAR, DeviceRole.COMPASS, (wrong, wrong)),
@@ -159,7 +159,7 @@ def wrong_devices() -> Iterator[Scenario]:
 
 
 def of_the_lidars_view() -> Iterator[Scenario]:
-    """Something before the lidar's window: scans go on coming, in time and well-formed."""
+    """Cover the lidar's window: scans continue, in time and well-formed."""
     blind = (Reason.LIDAR_SLOW, Reason.LIDAR_BLIND)
     for name, fault, seen in (
         ("covered all round", f"cover {ALL_ROUND} 19", (Reason.SCAN_STALE,)),
@@ -183,7 +183,7 @@ def of_the_lidars_view() -> Iterator[Scenario]:
 
 
 def of_the_lidars_clock() -> Iterator[Scenario]:
-    """Its clock runs apart from the computer's: the scans stay fresh."""
+    """Let its clock drift from the computer's: the scans stay fresh."""
     for name, ppm, hold in (
         ("1 % slow", -10_000, 45.0),
         ("slewed by -10 %", -100_000, 5.0),
@@ -198,7 +198,7 @@ def of_the_lidars_clock() -> Iterator[Scenario]:
 
 
 def of_answers() -> Iterator[Scenario]:
-    """Controllers that answer late, or restart before they answer; a motor that cannot turn."""
+    """Controllers that answer late, or restart before they answer; a blocked motor."""
     yield Scenario(
         Fault("drive: answers 40 ms late", command("drive", "delay 40"), command("drive", "delay 0"), hold=9.0),
         Expect.STOP_AHEAD,
@@ -306,7 +306,7 @@ def of_the_truck() -> Iterator[Scenario]:
 
 
 def of_software() -> Iterator[Scenario]:
-    """Requests, workers, bugs."""
+    """Faults of requests and workers, and bugs."""
     yield Scenario(
         Fault("station falls silent", station(silent=True), station()),
         Expect.STOP,

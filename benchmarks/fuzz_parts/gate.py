@@ -49,18 +49,18 @@ IDLE: Final = frozenset(WAYS_OUT)
 
 
 class Action(NamedTuple):
-    """One thing that happens to a gate."""
+    """One action on a gate."""
 
     what: str
     values: dict[str, Any]
 
 
 class BrokenRuleError(AssertionError):
-    """The gate did what it must not."""
+    """The gate violated a rule."""
 
 
 class Finding(NamedTuple):
-    """A shortest sequence that breaks the gate."""
+    """A shortest sequence that violates a rule."""
 
     kind: str
     """Kind of the body."""
@@ -69,7 +69,7 @@ class Finding(NamedTuple):
 
 
 def fuzz(seed: int, ticks: int) -> tuple[int, list[Finding]]:
-    """Runs on one body after the other until the gate has ticked so often: ticks, and every different finding."""
+    """Run one body after the other until the gate has ticked this often; return ticks and the distinct findings."""
     rng, done, found = random.Random(seed), 0, dict[tuple[str, str], Finding]()
     with np.errstate(all="ignore"):
         while done < ticks:
@@ -94,7 +94,7 @@ def _shortest(kind: str, error: str, actions: list[Action]) -> list[Action]:
 
 
 def _run(kind: str, actions: Sequence[Action]) -> tuple[int, str | None]:
-    """How often the gate ticked, and what went wrong; None = nothing."""
+    """Return the number of ticks, and the violated rule or None."""
     robot, ticked = Robot(kind).armed(), 0
     try:
         for what, values in actions:
@@ -172,7 +172,7 @@ def _times(rng: random.Random) -> dict[str, int]:
 
 
 def _sense(robot: Robot, what: str, values: dict[str, Any]) -> None:
-    """A message of a sensor; one that its model refuses never reaches the gate."""
+    """Send a sensor's message; one that its model rejects never reaches the gate."""
     head = {name: robot.now + values[name] for name in ("stamp", "received")} | {"seq": 1}
     more = {name: value for name, value in values.items() if name not in head}
     try:

@@ -1,4 +1,4 @@
-"""Generated missions, and scripts of what happens while they run."""
+"""Generated missions, and scripts of events while they run."""
 
 import json
 import random
@@ -11,7 +11,7 @@ VISITS = 400
 
 @dataclass
 class Script:
-    """What happens at the n-th step that begins, counted from 1, steps begun again included."""
+    """Events at the n-th step that begins, counted from 1, including repeated steps."""
 
     fails: set[int] = field(default_factory=set)
     """Goals that fail, if it is one."""
@@ -107,7 +107,7 @@ class _Maker:
 
 
 def mission(rng: random.Random) -> str:
-    """Return a random mission; JSON is YAML."""
+    """Return a random mission as JSON, which is valid YAML."""
     maker = _Maker(rng)
     policy = rng.choice(("abort", "continue", "return"))
     return json.dumps({"version": 2, "name": "generated", "on_failure": policy, "steps": maker.steps(3, 4)})

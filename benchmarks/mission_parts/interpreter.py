@@ -1,7 +1,7 @@
 """Independent interpreter of missions: recursive, on plain data, without the service's code.
 
-A node returns None if it succeeded, or the reason of its failure. A leaf advances the time by its duration and meets
-the events of the script. What interrupts a leaf from outside is an exception that the node concerned catches; an
+A node returns None if it succeeded, or the reason of its failure. A leaf advances the time by its duration and handles
+the events of the script. An external interruption of a leaf is an exception caught by the node concerned; an
 interruption that resumes runs within the interrupted leaf.
 """
 
@@ -15,7 +15,7 @@ from benchmarks.mission_parts.generator import BREAK_AFTER, CHANGE_AFTER, SECOND
 
 @dataclass
 class Outcome:
-    """How a mission ended, and the steps that it began."""
+    """End of a mission, and its started steps."""
 
     reason: str
     steps: list[str]
@@ -24,15 +24,15 @@ class Outcome:
 
 
 class AmbiguousError(Exception):
-    """A limit ends so close to another event that the order depends on the service's rate of checks."""
+    """A limit ends so close to another event that the order depends on the service's check rate."""
 
 
 class OverError(Exception):
-    """The mission is over."""
+    """The mission has ended."""
 
 
 class HomeError(Exception):
-    """The robot drives back because of a reason."""
+    """The robot drives back for a reason."""
 
 
 @dataclass(eq=False)
@@ -136,7 +136,7 @@ class _Interpreter:
                 return result
 
     def watches(self) -> None:
-        """Run what a watch has begun, and then again until nothing interrupts."""
+        """Run what a watch has started, repeatedly until nothing interrupts."""
         while (interrupted := self.interrupting()) is not None:
             scope, index = interrupted
             inside, watch = self.scopes, scope.node["watch"][index]
@@ -158,7 +158,7 @@ class _Interpreter:
         return None
 
     def run(self, node: dict[str, Any]) -> tuple[bool, str | None]:
-        """One run of a leaf: whether it has to begin again, or its result."""
+        """Run a leaf once; return whether it must start again, and its result."""
         kind = node["do"]
         if (expired := self.expired(0.0)) is not None:
             raise LeftError(expired, "timeout")
@@ -185,7 +185,7 @@ class _Interpreter:
         return False, "goal_unreachable" if kind in ("goto", "return") and self.visit in self.script.fails else None
 
     def met(self, node: dict[str, Any], stop: float) -> bool | None:
-        """Events before a leaf stops: None if it goes on, whether it has to begin again if it ends by them."""
+        """Handle events before a leaf stops: None if it continues, otherwise whether it must start again."""
         if stop > CHANGE_AFTER and self.visit in self.script.changes:
             key, value = self.script.changes[self.visit]
             setattr(self, key, value)
@@ -234,7 +234,7 @@ def label(node: dict[str, Any]) -> str:
 
 
 def expected(text: str, script: Script) -> Outcome:
-    """Return how a mission has to go.
+    """Return the required outcome of a mission.
 
     Raises:
         AmbiguousError: it depends on fractions of a second.

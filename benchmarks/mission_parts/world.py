@@ -1,4 +1,4 @@
-"""The mission service with services that end their tasks as a script says."""
+"""The mission service with services that end their tasks according to a script."""
 
 import asyncio
 import json
@@ -141,7 +141,7 @@ def read(text: str) -> Mission:
 
 
 def done(text: str, script: Script) -> Outcome:
-    """Run a mission, and return how it went."""
+    """Run a mission, and return its outcome."""
     mission = read(text)
     with tempfile.TemporaryDirectory(prefix="missions") as folder:
         return run_virtual(lambda clock: _run(clock, mission, script, Path(folder) / "mission.json"), start=SECOND)

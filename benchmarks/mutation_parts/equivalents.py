@@ -1,4 +1,4 @@
-"""Mutants that behave as the sound source does, so that no test can find them, each with its reason."""
+"""Mutants with the same behaviour as the source, so that no test can kill them, each with its reason."""
 
 from typing import Final
 

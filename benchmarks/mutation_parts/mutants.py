@@ -1,4 +1,4 @@
-"""Single-point faults in a Python source: what could be written there by mistake, found in its syntax tree."""
+"""Single-point faults in a Python source: plausible mistakes, found in its syntax tree."""
 
 import ast
 from collections.abc import Iterator
@@ -75,7 +75,7 @@ class Mutant:
 
     @property
     def key(self) -> str:
-        """What it is, wherever its line moves to."""
+        """Identifier independent of the line number."""
         return f"{self.file}::{self.where}: {self.before} -> {self.after}"
 
     def applied(self, source: bytes) -> bytes:
@@ -184,15 +184,15 @@ class Finder(ast.NodeVisitor):
         self.add("left out", node, "pass")
 
     def visit_Assert(self, node: ast.Assert) -> None:
-        """States an invariant; checks nothing."""
+        """Skip: an assert states an invariant."""
 
     def visit_keyword(self, node: ast.keyword) -> None:
-        """``strict=True`` of ``zip`` states an invariant too."""
+        """Skip ``strict=True`` of ``zip``, which states an invariant."""
         if node.arg != "strict":
             self.visit(node.value)
 
     def visit_JoinedStr(self, node: ast.JoinedStr) -> None:
-        """Words for people."""
+        """Skip text for people."""
 
     def _conditional(self, node: ast.If | ast.While | ast.IfExp) -> None:
         if "TYPE_CHECKING" not in self.text(node.test) and not isinstance(node.test, ast.Constant):
@@ -289,6 +289,6 @@ class Finder(ast.NodeVisitor):
 
 
 def all_mutants(files: dict[str, bytes]) -> Iterator[Mutant]:
-    """Mutants of all files, by their names relative to the project."""
+    """Return the mutants of all files, by their names relative to the project."""
     for file, source in files.items():
         yield from mutants(file, source)

@@ -1,9 +1,10 @@
 """Runs tests against mutants: two servers for each job, which fork one process for each mutant.
 
-    python -m benchmarks.mutation_parts.runner warm|cold TEST ...      (what ``mutation.py`` starts; speaks JSON lines)
+    python -m benchmarks.mutation_parts.runner warm|cold TEST ...      (started by ``mutation.py``; JSON lines)
 
-The warm server has collected all tests; a fork of it takes the faulty functions' code in and runs the tests that reach
-them. What runs on import cannot be exchanged like that: a fork of the cold server imports the faulty source itself.
+The warm server has collected all tests; its fork replaces the code of the faulty functions and runs the tests that
+reach them. Code that runs on import cannot be replaced in this way: a fork of the cold server imports the faulty source
+itself.
 """
 
 import contextlib
@@ -70,14 +71,14 @@ class Server:
         )  # fmt: skip
 
     def judge(self, file: str, sound: str, faulty: str, tests: dict[str, float], seconds: float) -> tuple[str, str]:
-        """What becomes of a faulty ``file``, and the test that found it; COLD: it cannot say.
+        """Return the verdict on a faulty ``file``, and the test that killed it; COLD: it cannot judge it.
 
         Args:
-            file: relative to the project.
-            sound: its source.
-            faulty: the mutant's.
-            tests: in their order, each with the processor time it may take, s.
-            seconds: of processor time for all of them.
+            file: path relative to the project.
+            sound: unmodified source.
+            faulty: source of the mutant.
+            tests: tests in their order, each with its limit of processor time, s.
+            seconds: limit of processor time for all of them.
         """
         assert self._process.stdin is not None
         assert self._process.stdout is not None
@@ -94,7 +95,7 @@ class Server:
 
 
 class _FirstFailure:
-    """Pytest plug-in: the first test that fails; runs the tests given before others."""
+    """Pytest plug-in that stops at the first failed test, and runs the given tests first."""
 
     def __init__(self, first: list[str]) -> None:
         self.test = ""
@@ -109,7 +110,7 @@ class _FirstFailure:
 
 
 class _Served:
-    """Pytest plug-in of the warm server: forks run the tests that were collected."""
+    """Pytest plug-in of the warm server, whose forks run the collected tests."""
 
     def __init__(self, orders: Iterator[dict[str, Any]], answers: IO[str]) -> None:
         self._orders = orders
@@ -144,18 +145,17 @@ class _Served:
 
 
 def _limit(seconds: float) -> None:
-    """End this process after so much more processor time, or ``SHARE`` times as much by the clock."""
+    """Limit the remaining processor time of this process, and its elapsed time to ``SHARE`` times as much."""
     used, hard = time.process_time(), resource.getrlimit(resource.RLIMIT_CPU)[1]
     resource.setrlimit(resource.RLIMIT_CPU, (min(math.ceil(used + seconds), hard), hard))
     signal.setitimer(signal.ITIMER_REAL, SHARE * seconds)
 
 
 def _exchange(functions: Collection[FunctionType], sound: str, faulty: str, path: str) -> None:
-    """Give the functions of a file the code of its faulty source.
+    """Replace the code of the functions of a file by that of its faulty source.
 
     Raises:
-        ValueError: that is not possible: the file is imported by the tests themselves, or a function's free variables
-            are others.
+        ValueError: not possible: the tests themselves import the file, or a function's free variables differ.
     """
     if not functions:
         raise ValueError(path)
@@ -167,7 +167,7 @@ def _exchange(functions: Collection[FunctionType], sound: str, faulty: str, path
 
 
 def _codes(module: CodeType) -> dict[tuple[str, int], CodeType]:
-    """Code objects by qualified name, and its number where several have the same."""
+    """Return the code objects by qualified name, numbered where several have the same."""
     found: dict[tuple[str, int], CodeType] = {}
     seen: Counter[str] = Counter()
     waiting = [module]
@@ -203,7 +203,7 @@ def _serve(
 
 
 def _forked(run: Callable[[], tuple[int, str]], seconds: float) -> tuple[str, str]:
-    """Run in a process of its own group, for some seconds of processor time; a verdict and the test behind it."""
+    """Run in a separate process group with limited processor time; return the verdict and its test."""
     read, write = os.pipe()
     child = os.fork()
     if child == 0:

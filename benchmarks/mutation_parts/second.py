@@ -1,4 +1,4 @@
-"""A second set of operators: other mistakes, each found in the syntax tree as those of ``mutants`` are."""
+"""A second set of operators: other mistakes, found in the syntax tree like those of ``mutants``."""
 
 import ast
 
@@ -29,7 +29,7 @@ def second_mutants(file: str, source: bytes) -> list[Mutant]:
 
 
 class _Second(Finder):
-    """Finds them."""
+    """Finds mutants of the second set."""
 
     def __init__(self, file: str, source: bytes) -> None:
         super().__init__(file, source)
@@ -85,10 +85,10 @@ class _Second(Finder):
         self.generic_visit(node)
 
     def visit_Assert(self, node: ast.Assert) -> None:
-        """States an invariant; checks nothing."""
+        """Skip: an assert states an invariant."""
 
     def visit_JoinedStr(self, node: ast.JoinedStr) -> None:
-        """Words for people."""
+        """Skip text for people."""
 
     # Expressions
 
@@ -137,6 +137,6 @@ class _Second(Finder):
         self.visit(node.value)
 
     def visit_keyword(self, node: ast.keyword) -> None:
-        """``strict=True`` of ``zip`` states an invariant."""
+        """Skip ``strict=True`` of ``zip``, which states an invariant."""
         if node.arg != "strict":
             self.visit(node.value)
