@@ -125,7 +125,7 @@ class _Touch:
 
 
 def end_touch(touched: _Touch | None, now: int, out: Drive) -> None:
-    """End a contact when the operator changes the motion or the drive ends; contacts too short to be noticed do not count."""
+    """End a contact when the operator changes the motion or the drive ends; short contacts do not count."""
     if touched is None:
         return
     lasted = (now - touched.at) / SECOND

@@ -1,9 +1,9 @@
-"""Navigation against its peers: motions, routes, deformation, tracking, whole runs.
+"""Navigation against its peers: motions, routes, deformation, tracking, complete runs.
 
     python benchmarks/navigation.py [--data DIR] [--only PART ...] [--runs N] [--quick]
 
-DIR holds ``maps/NAME.yaml`` and ``planning/queries.json``. Times are processor time of the calling thread. Plots go to
-runs/navigation. The last line is JSON.
+DIR contains ``maps/NAME.yaml`` and ``planning/queries.json``. Times are processor time of the calling thread. Plots are
+written to runs/navigation. The last line is JSON.
 """
 
 import argparse

@@ -2,8 +2,8 @@
 
     python benchmarks/older_figures.py
 
-``docs/pictures/sources.json`` names what each picture shows. The last line is JSON. The site has the number of later
-commits below every table.
+``docs/pictures/sources.json`` names the subject of each picture. The last line is JSON. The site shows the number of
+later commits below every table.
 """
 
 import json

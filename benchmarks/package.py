@@ -33,7 +33,7 @@ NEXT, BROKEN = f"{__version__}+1", f"{__version__}+2"
 
 
 class Packages(Bench):
-    """What was found, and the machine of the Debian packages."""
+    """Results, and the machine of the Debian packages."""
 
     command = "/usr/bin/monstertruckd"
 
@@ -47,7 +47,7 @@ class Packages(Bench):
         return self.active() and f"/opt/monstertruckd/{version}/" in self.exec_start()
 
     def folders(self) -> set[str]:
-        """Versions that are installed."""
+        """Return the installed versions."""
         return {place.name for place in (self.machine.root / "opt/monstertruckd").iterdir()}
 
     def dpkg(self, version: str) -> Output:
@@ -55,7 +55,7 @@ class Packages(Bench):
         return self.machine.run("dpkg", "--install", self.debs[version], check=False)
 
     def program(self, *arguments: str, folder: Path = Path()) -> Output:
-        """Run the program that the package has put into the path."""
+        """Run the program installed by the package."""
         return self.machine.run(self.command, *arguments, check=False)
 
 
@@ -98,7 +98,7 @@ def packages(name: str) -> Iterator[Path]:
 
 
 def pythons(uv: str) -> Iterator[str]:
-    """Yield the paths of the supported Pythons that are on this computer, and say which are not."""
+    """Yield the paths of the supported Pythons on this computer, and print the missing ones."""
     for version in PYTHONS:
         done = tried(uv, "python", "find", "--no-python-downloads", "--system", version)
         if done.returncode == 0:
@@ -137,7 +137,7 @@ def tried(*command: str | Path, cwd: Path = ROOT) -> Output:
 
 
 def debian(bench: Packages, scratch: Path) -> None:
-    """Everything that happens to a package on a robot."""
+    """Test the life of a package on a robot."""
     install_tools()
     if not bench.machine.root.exists():
         bench.machine.build()
@@ -152,7 +152,7 @@ def debian(bench: Packages, scratch: Path) -> None:
 
 
 def deb(bench: Packages, version: str, scratch: Path) -> str:
-    """Build one version from a copy of this checkout; return where it is inside the machine."""
+    """Build one version from a copy of this checkout; return its path inside the machine."""
     tree = scratch / f"tree-{version}"
     copy_tree(tree)
     replaced(tree / "monstertruckd/__init__.py", f'__version__ = "{__version__}"', f'__version__ = "{version}"')
@@ -170,7 +170,7 @@ def deb(bench: Packages, version: str, scratch: Path) -> str:
 
 
 def replaced(file: Path, before: str, after: str) -> None:
-    """Replace a text that a file holds once."""
+    """Replace a text that occurs once in a file."""
     text = file.read_text(encoding="utf-8")
     assert text.count(before) == 1, f"{file.name} has changed: {before!r}"
     file.write_text(text.replace(before, after), encoding="utf-8")
@@ -240,7 +240,7 @@ def removal(bench: Packages) -> None:
 
 
 def main() -> int:
-    """Run both parts; 0 if every goal is met."""
+    """Run both parts; return 0 if all goals are met."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parts = {"wheels": wheels, "debian": debian}
     parser.add_argument("--only", nargs="+", choices=parts, default=list(parts), help="parts to run")

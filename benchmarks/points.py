@@ -80,12 +80,12 @@ class Score:
     read_ms: list[float] = field(default_factory=list)
 
     def add(self, other: "Score") -> None:
-        """Put another drive's figures in."""
+        """Add another drive's figures."""
         for name, value in vars(other).items():
             setattr(self, name, getattr(self, name) + value)
 
     def figures(self) -> dict[str, Any]:
-        """For the report."""
+        """Return the reported figures."""
         return {
             "near": self.near,
             "recall": self.found / max(self.near, 1),
@@ -103,7 +103,7 @@ class Score:
 
 
 def tags_on_walls(name: str, rng: np.random.Generator) -> tuple[TagConfig, ...]:
-    """Tags at random places of a built-in world's straight walls, where 0.7 m before them is free."""
+    """Return tags at random places of a built-in world's straight walls with 0.7 m of free space in front."""
     world = World(WorldConfig(map=name), 1)
     cells, step, origin = world.map.cells, world.map.resolution, world.map.origin
     ahead, wide = round(0.7 / step), round(0.075 / step)
@@ -132,13 +132,13 @@ def tags_on_walls(name: str, rng: np.random.Generator) -> tuple[TagConfig, ...]:
 
 
 def world_of(name: str, engine: Any, tags: tuple[TagConfig, ...], seed: int) -> World:
-    """With the tags, and a camera of a lens with distortion and noise."""
+    """Return the world with the tags, and a camera with distortion and noise."""
     camera = CameraConfig(noise=3.0, rendered=engine == "mujoco", **LENS)
     return World(WorldConfig(map=name, engine=engine, tags=tags, camera=camera), seed)
 
 
 def drive(world: World, rng: np.random.Generator, metres: float) -> Iterator[Pose]:
-    """Poses at the rate of the pictures: from place to place, at each of which the truck turns to the nearest wall."""
+    """Yield poses at the rate of the images: from place to place, turning to the nearest wall at each."""
     cells, step, origin = world.map.cells, world.map.resolution, world.map.origin
     away, nearest = distance_transform_edt(cells == FREE, return_indices=True)
     coarse = max(1, round(0.1 / step))
@@ -207,7 +207,7 @@ def _place(node: int, width: int, cell: float, origin: tuple[float, float]) -> t
 
 
 def near_tags(world: World, pose: Pose, tags: tuple[TagConfig, ...]) -> set[int]:
-    """Tags that are near enough, not too oblique, whole in the picture and not hidden, by the world's truth."""
+    """Return the tags near enough, not too oblique, whole in the image and not hidden, by the world's truth."""
     camera = world.view.config
     place = mounted(pose, camera)
     focal = SIZE[0] / 2 / math.tan(camera.field_of_view / 2)
@@ -240,7 +240,7 @@ def near_tags(world: World, pose: Pose, tags: tuple[TagConfig, ...]) -> set[int]
 
 
 def light(name: str, engine: str, seed: int, metres: float) -> Score:
-    """One drive."""
+    """Run one drive."""
     rng = np.random.default_rng(seed)
     tags = tags_on_walls(name, rng)
     world, score = world_of(name, engine, tags, seed), Score()
@@ -273,7 +273,7 @@ def light(name: str, engine: str, seed: int, metres: float) -> Score:
 
 
 def judge(score: Score, points: Any, tags: tuple[TagConfig, ...], near: set[int]) -> None:
-    """Compare with the truth."""
+    """Compare the points with the truth."""
     true = {tag.tag: tag for tag in tags}
     found = set()
     for point in points:
@@ -297,7 +297,7 @@ def judge(score: Score, points: Any, tags: tuple[TagConfig, ...], near: set[int]
 
 
 def daemon(seed: int, limit: float = 900.0) -> dict[str, Any]:
-    """``configs/points.yaml``: the truck maps, explores and finds all six tags."""
+    """Run ``configs/points.yaml``: the truck maps, explores and finds all six tags."""
     config = load_config(ROOT / "configs" / "points.yaml", SimulatedTruckConfig)[0]
     score = Score()
     with TemporaryDirectory() as folder:
@@ -331,7 +331,7 @@ def daemon(seed: int, limit: float = 900.0) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Run it."""
+    """Run the selected parts."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--metres", type=float, default=40.0)

@@ -1,4 +1,4 @@
-"""Turns of phrase that a reader stumbles over, per 1000 words of docstrings, comments, messages and pages.
+"""Turns of phrase that slow a reader down, per 1000 words of docstrings, comments, messages and pages.
 
     python benchmarks/prose.py [--list] [PATH ...]
 

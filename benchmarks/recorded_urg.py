@@ -47,7 +47,7 @@ numpy.savez(target, stamps=[s.stamp for s in scans], seqs=[s.seq for s in scans]
 
 @dataclass(frozen=True)
 class Result:
-    """What the other process got."""
+    """Messages received by the other process."""
 
     sent: int
     received: int
@@ -59,7 +59,7 @@ class Result:
 
 
 async def play(clock: WallClock, folder: Path, config: Path, recording: RecordedRanges) -> Result:
-    """Run daemon, subscriber and emulator; compare what arrived with ``recording``."""
+    """Run daemon, subscriber and emulator; compare the received scans with ``recording``."""
     endpoint = free_endpoint()
     overlay = write_overlay(config, folder, endpoint)
     pipe = asyncio.subprocess.PIPE
@@ -100,7 +100,7 @@ async def _said(process: asyncio.subprocess.Process, words: str) -> str:
 def compare(
     recording: RecordedRanges, began: int, stamps: np.ndarray, seqs: np.ndarray, ranges: np.ndarray, codes: np.ndarray
 ) -> Result:
-    """Exact comparison; readings below 20 mm are error codes and must arrive as such."""
+    """Compare exactly; readings below 20 mm are error codes and must arrive as such."""
     raw = recording.ranges[: len(ranges)]
     valid = raw >= 20
     good = np.where(valid, ranges == raw / 1000.0, np.isinf(ranges)) & (codes == np.where(valid, VALID_BEAM, raw))

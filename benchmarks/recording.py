@@ -1,20 +1,20 @@
-"""What recording costs, what it does to the control loop, and what a crash loses.
+"""Cost of recording, its effect on the control loop, and the loss by a crash.
 
     python benchmarks/recording.py [--rounds N] [--kills N]
 
-Cost: processor time per 1000 messages of a second's mix (100 poses, 10 scans, 2 pictures of 100 kB), from
-``record()`` to the closed chunks in the file, compressed by zstd, compared with the Python writer of rosbag 1 (Debian's
-``python3-rosbag``, which need not be there) that writes the same bytes, by default uncompressed; both in turn. The
-codec's cost is not in it, as the bus pays it. Both run in the system's Python, where it is of our version.
+Cost: processor time per 1000 messages of a second's mix (100 poses, 10 scans, 2 images of 100 kB), from ``record()`` to
+the closed chunks in the file, compressed by zstd, compared with the Python writer of rosbag 1 (Debian's
+``python3-rosbag``, optional), which writes the same bytes, by default uncompressed; both in turn. The cost of the codec
+is excluded, because the bus pays it. Both run in the system's Python if it has our version.
 
 Stall: lateness of a 1 ms ticker on the loop that records the mix in real time, compared with the same ticker without
-recording; the figure is the difference of the greatest ones, in the median of the rounds. That is worth something
-on a quiet machine only, so the recorder's longest turn is reported, too: the greatest processor time its thread takes
-between two waits for work, for which it may keep the interpreter from the loop.
+recording; the figure is the difference of the maxima, as the median of the rounds. It is only meaningful on a quiet
+machine; therefore the recorder's longest turn is reported, too: the maximum processor time of its thread between two
+waits for work, during which it may keep the interpreter from the loop.
 
-Crash: a recording process is killed -9 at a random instant; the file is repaired as at the next start and read by
-the stock reader. A cut of power is modelled as the loss of everything after the newest fsync, which is what a disk
-promises. The last line is JSON.
+Crash: a recording process is killed with SIGKILL at a random instant; the file is repaired as at the next start and
+read by the official reader. A power cut is modelled as the loss of everything after the latest fsync, which is what a
+disk guarantees. The last line is JSON.
 """
 
 import argparse
@@ -56,7 +56,7 @@ Mix = list[tuple[Topic, bytes]]
 
 
 def mix() -> Mix:
-    """A second's messages in the order of their times, encoded."""
+    """Return a second's messages in the order of their times, encoded."""
     rng = np.random.default_rng(1)
     header: dict[str, Any] = {"stamp": SECOND, "received": SECOND, "seq": 1}
     pose = Odometry(
@@ -90,7 +90,7 @@ def mix() -> Mix:
 
 
 def config(folder: Path) -> RecorderConfig:
-    """The default recorder, but with zstd."""
+    """Return the default recorder, with zstd."""
     return RecorderConfig(directory=str(folder), compression=Compression.ZSTD)
 
 
@@ -102,7 +102,7 @@ def _no_failure(reason: object, text: str) -> None:
 
 
 async def recorder_cost(clock: WallClock, messages: Mix) -> float:
-    """Processor seconds per 1000 messages of all threads, ``SECONDS`` of the mix at about 50 times real time."""
+    """Return processor seconds of all threads per 1000 messages, for ``SECONDS`` of the mix."""
     with tempfile.TemporaryDirectory() as folder:
         async with Recorder(config(Path(folder)), clock, _no_failure) as recorder:
             await clock.sleep(0.2)
@@ -137,7 +137,7 @@ with tempfile.TemporaryDirectory() as folder:
 
 
 def rosbag_cost(messages: Mix, folder: Path) -> float:
-    """The same bytes through rosbag 1's Python writer, default settings (no compression)."""
+    """Write the same bytes with rosbag 1's Python writer, with default settings (no compression)."""
     files = {topic.name: folder / topic.group for topic in RATES}
     files = {name: path.with_name(name.replace("/", "-")) for name, path in files.items()}
     for topic, data in messages:
@@ -154,7 +154,7 @@ def has_rosbag() -> bool:
 
 
 def cost(rounds: int) -> dict[str, float]:
-    """Medians; the ratio is that of one round."""
+    """Return medians; the ratio is within one round."""
     messages, with_rosbag = mix(), has_rosbag()
     ours, theirs = np.empty(rounds), np.empty(rounds)
     with tempfile.TemporaryDirectory() as folder:
@@ -174,14 +174,14 @@ def cost(rounds: int) -> dict[str, float]:
 
 
 class TimedQueue(queue.SimpleQueue):
-    """Notes the processor time that its reader takes between two calls of ``get``."""
+    """Records the processor time of its reader between two calls of ``get``."""
 
     def __init__(self) -> None:
         self.turns: list[float] = []
         self._begin: float | None = None
 
     def get(self, block: bool = True, timeout: float | None = None) -> Any:
-        """As ever."""
+        """Get an item as usual."""
         if self._begin is not None:
             self.turns.append(1e3 * (time.thread_time() - self._begin))
         try:
@@ -191,7 +191,7 @@ class TimedQueue(queue.SimpleQueue):
 
 
 async def lateness(clock: WallClock, messages: Mix, *, recording: bool) -> tuple[np.ndarray, float]:
-    """Milliseconds late of a 1 ms ticker, with the mix recorded in real time or not at all; the longest turn, ms."""
+    """Return the lateness (ms) of a 1 ms ticker, with or without recording in real time; and the longest turn, ms."""
     late: list[float] = []
     work = TimedQueue()
 
@@ -220,7 +220,7 @@ async def lateness(clock: WallClock, messages: Mix, *, recording: bool) -> tuple
 
 
 def stall(rounds: int) -> dict[str, float]:
-    """Greatest lateness with recording, less that without, in the median of the rounds."""
+    """Return the maximum lateness with recording, minus that without, as the median of the rounds."""
     messages = mix()
     greatest = np.empty((rounds, 2))
     p999 = np.empty((rounds, 2))
@@ -244,7 +244,7 @@ def stall(rounds: int) -> dict[str, float]:
 
 
 async def record_for_ever(clock: WallClock, folder: Path) -> None:
-    """The process that is killed: says which file, and after every fsync how much of it is on the disk."""
+    """Record until killed; print the file, and after every fsync its size on the disk."""
     messages = mix()
     sync = LogFile.sync
 
@@ -266,7 +266,7 @@ async def record_for_ever(clock: WallClock, folder: Path) -> None:
 
 
 def crashes(kills: int) -> dict[str, float]:
-    """Kill ``kills`` recordings, four at a time, each after another time of up to two periods of fsync."""
+    """Kill ``kills`` recordings, four at a time, each after a different time of up to two periods of fsync."""
     rng = np.random.default_rng(1)
     lost, unreadable, lost_power = [], 0, []
     with tempfile.TemporaryDirectory() as folder:
@@ -318,7 +318,7 @@ class _Child:
         return self.path.stat().st_size
 
     def lost(self, size: int) -> float:
-        """Seconds before the kill that the repaired first ``size`` bytes of the file do not have."""
+        """Return the seconds before the kill that are missing in the repaired first ``size`` bytes of the file."""
         cut = self.path.with_name(f"cut-{size}.mcap")
         shutil.copy(self.path, cut)
         with cut.open("r+b") as file:

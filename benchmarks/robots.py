@@ -86,7 +86,7 @@ def configured(name: str, **overlay: Any) -> SimulatedTruckConfig:
 
 
 def driven(config: SimulatedTruckConfig, story: Story) -> dict[str, Any]:
-    """Let a story happen to a robot; what it returned, the truth and the newest map."""
+    """Run a story on a robot; return its result, the truth and the latest map."""
 
     async def main(clock: VirtualClock) -> dict[str, Any]:
         rig = VirtualRig(config, clock)
@@ -100,7 +100,7 @@ def driven(config: SimulatedTruckConfig, story: Story) -> dict[str, Any]:
 
 
 def own_contacts(rig: VirtualRig) -> int:
-    """Times that the robot moved into a person or a wall."""
+    """Return how often the robot moved into a person or a wall."""
     stuck = rig.truth.array()[:, 5] > 0
     walls_met = int((stuck[1:] & ~stuck[:-1]).sum())
     met = (one.speed if one.mover == rig.config.robot else one.other_speed for one in rig.world.scene.contacts)
@@ -108,7 +108,7 @@ def own_contacts(rig: VirtualRig) -> int:
 
 
 def walls(grid: Grid | None) -> dict[str, float]:
-    """The map's error against the circuit."""
+    """Return the map's error against the circuit."""
     if grid is None:
         return {"wall_mean_m": math.inf, "wall_p95_m": math.inf}
     world = BUILT_IN["circuit"]().map
@@ -121,7 +121,7 @@ def walls(grid: Grid | None) -> dict[str, float]:
 
 
 def lap_of(name: str) -> dict[str, Any]:
-    """A lap of the circuit while it maps."""
+    """Drive a lap of the circuit while mapping."""
     path = {"file": ROOT / "configs" / "paths" / "circuit.csv", "closed": True}
     config = configured(name, path=path, slam={"map_period": 2.0})
 
@@ -140,7 +140,7 @@ def lap_of(name: str) -> dict[str, Any]:
 
 
 def goals_of(name: str, count: int, seed: int = 1) -> dict[str, Any]:
-    """Places drawn along the circuit, each within sight of the one before, among people."""
+    """Drive to places along the circuit, each within sight of the last one, among people."""
     config = configured(name, sim={"world": {"people": list(PEOPLE)}})
     rng = np.random.default_rng([seed, count])
     line = lap(CIRCUIT)
@@ -166,7 +166,7 @@ def goals_of(name: str, count: int, seed: int = 1) -> dict[str, Any]:
 
 
 async def to_goal(rig: VirtualRig, operator: LocalOperator, x: float, y: float, yaw: float, refusals: list[str]) -> str:
-    """Drive to a place, asked again after refusals, armed again after stops that disarm; the outcome."""
+    """Drive to a place, retried after refusals, armed again after stops that disarm; return the outcome."""
     clock = rig.clock
     with rig.bus.subscribe(topics.GOAL, fifo(4096)) as states, rig.bus.subscribe(topics.GATE, latest()) as gate:
         request = {"frame": "map", "goal": {"x": x, "y": y, "yaw": yaw}, "waypoints": []}
@@ -186,7 +186,7 @@ async def to_goal(rig: VirtualRig, operator: LocalOperator, x: float, y: float, 
 
 
 def exploration_of(name: str) -> dict[str, Any]:
-    """From nothing to a whole map, and home."""
+    """Explore without a map, and drive home."""
     config = configured(name, slam={"map_period": 2.0})
 
     async def story(rig: VirtualRig, operator: LocalOperator) -> dict[str, Any]:
@@ -216,7 +216,7 @@ def exploration_of(name: str) -> dict[str, Any]:
 
 
 def known_share(grid: Grid | None) -> float:
-    """Share of the circuit's ground near its lap, where a robot drives, that the map knows."""
+    """Return the known share of the circuit's ground near its lap."""
     if grid is None:
         return 0.0
     world = BUILT_IN["circuit"]().map
@@ -230,7 +230,7 @@ def known_share(grid: Grid | None) -> float:
 
 
 def faults_of(name: str, count: int) -> dict[str, Any]:
-    """A drill of families of faults."""
+    """Run a drill of fault families."""
     report = Campaign(1, count, configured(name)).run(jobs=1)
     figures = report.figures()
     return {key: figures[key] for key in ("trials", "unsafe", "contacts", "stuck", "recovery_p99_s")}
@@ -240,7 +240,7 @@ def faults_of(name: str, count: int) -> dict[str, Any]:
 
 
 def figures_of(kept: dict[str, Any], robots: tuple[str, ...]) -> dict[str, Any]:
-    """What was found, flat."""
+    """Return the figures as a flat mapping."""
     return {
         f"{robot}_{part}_{key}": value
         for robot in robots
@@ -251,7 +251,7 @@ def figures_of(kept: dict[str, Any], robots: tuple[str, ...]) -> dict[str, Any]:
 
 
 def shortcomings(robot: str, part: str, run: dict[str, Any] | None) -> list[str]:
-    """Why a part does not meet its goal."""
+    """Return why a part does not meet its goal."""
     if run is None:
         return ["not run"]
     wanted: list[tuple[str, bool]] = [(f"{run['contacts']} contacts", run["contacts"] == 0)]
@@ -282,7 +282,7 @@ def shortcomings(robot: str, part: str, run: dict[str, Any] | None) -> list[str]
 
 
 def main() -> int:
-    """Run what is asked for; 0 = all goals met."""
+    """Run the selected parts; 0: all goals are met."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=ROBOTS)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)

@@ -80,7 +80,7 @@ DOMAIN = "77"
 async def process(
     *words: str, folder: Path = ROOT, errors: int | None = None, environment: Mapping[str, str] | None = None
 ) -> AsyncIterator[asyncio.subprocess.Process]:
-    """A process that is ended at the end."""
+    """Run a process for the duration of the context."""
     pipe = asyncio.subprocess.PIPE
     running = await asyncio.create_subprocess_exec(
         *words, stdin=pipe, stdout=pipe, stderr=errors, cwd=folder, env=os.environ | (environment or {})
@@ -94,13 +94,13 @@ async def process(
 
 
 def processor_seconds(pid: int) -> float:
-    """Processor time of a process so far."""
+    """Return the processor time of a process so far."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / TICKS
 
 
 async def connected(endpoint: str, clock: WallClock) -> TruckClient:
-    """A client of the robot, once its daemon answers."""
+    """Return a client of the robot once its daemon answers."""
     while True:
         with suppress(TruckError):
             client = TruckClient("truck", endpoint, clock=clock, source="bench")
@@ -114,7 +114,7 @@ async def connected(endpoint: str, clock: WallClock) -> TruckClient:
 
 @dataclass(frozen=True, slots=True)
 class Face:
-    """A face, and the programs of others that judge it."""
+    """A face, and the independent programs that judge it."""
 
     kind: str
     python: str
@@ -135,7 +135,7 @@ class Face:
 
     @asynccontextmanager
     async def serving(self, robot: str) -> AsyncIterator[asyncio.subprocess.Process]:
-        """The face of a robot, once ROS 2 sees it."""
+        """Run the face of a robot, once ROS 2 sees it."""
         own = ("--face", "rclpy") if self.kind == "rclpy" else ("--listen", self.ros)
         words = (self.python, "-m", "monstertruckd", "ros2", "--robot", f"truck@{robot}", *own)
         async with process(*words, errors=asyncio.subprocess.STDOUT, environment=self.environment) as face:
@@ -148,7 +148,7 @@ class Face:
             rest.cancel()
 
     def judge(self, what: str, *words: str) -> Any:
-        """A process that reads, drives by twists, or sends goals."""
+        """Run a process that reads, drives by twists, or sends goals."""
         if self.kind == "rclpy":
             return process(self.python, "-m", f"{PARTS}.rclpy_judge", what, *words, environment=self.environment)
         names = {"read": "sdk_reader", "twists": "pyzeros_driver", "drive": "pyzeros_goals"}
@@ -166,19 +166,19 @@ class Face:
 
 
 def python_path() -> str:
-    """Import path of a process in another folder."""
+    """Return the import path for a process in another folder."""
     own = ":".join(str(ROOT / part) for part in ("", "drivers", "planners", "schemas"))
     return f"{own}:{os.environ.get('PYTHONPATH', '')}"
 
 
 async def answered(judge: asyncio.subprocess.Process, line: str = "go") -> Any:
-    """Have a judge that is ready begin; returns the JSON of its last line."""
+    """Start a ready judge; return the JSON of its last line."""
     text, _ = await judge.communicate(f"{line}\n".encode())
     return json.loads(text.splitlines()[-1])
 
 
 async def ready(judge: asyncio.subprocess.Process) -> None:
-    """Wait until a judge has loaded and compiled what it needs."""
+    """Wait until a judge has finished loading and compiling."""
     assert judge.stdout is not None
     while (await judge.stdout.readline()).strip() != b"ready":
         pass
@@ -189,7 +189,7 @@ async def ready(judge: asyncio.subprocess.Process) -> None:
 
 @dataclass(slots=True)
 class StandIn:
-    """A robot's bus without devices, whose messages and requests are known."""
+    """A robot's bus without devices, with known messages and requests."""
 
     robot: Robot
     real_offset: int
@@ -198,7 +198,7 @@ class StandIn:
 
 @asynccontextmanager
 async def stand_in(clock: WallClock) -> AsyncIterator[StandIn]:
-    """A robot that publishes every topic."""
+    """Run a robot that publishes every topic."""
     async with running_robot() as robot:
         found = StandIn(robot, clock.real_offset())
         gate, offset = (robot.bus.publisher(topic, topic.writer) for topic in (t.GATE, t.CLOCK))
@@ -242,7 +242,7 @@ async def stand_in(clock: WallClock) -> AsyncIterator[StandIn]:
 
 
 async def read_all(face: Face, scene: StandIn, pid: int, seconds: float, folder: Path) -> dict[str, Any]:
-    """Equality, rates and processor time of the face while a judge reads all topics."""
+    """Return equality, rates and processor time of the face while a judge reads all topics."""
     output = folder / f"{face.kind}.pickle"
     async with face.judge("read", str(seconds), str(output)) as reader:
         await asyncio.sleep(6.0)  # until it has subscribed to everything
@@ -255,7 +255,7 @@ async def read_all(face: Face, scene: StandIn, pid: int, seconds: float, folder:
 
 
 async def timed(face: Face, scene: StandIn) -> dict[str, Any]:
-    """Latency of twists up to the robot's bus."""
+    """Return the latency of twists to the robot's bus."""
     requests = scene.robot.bus.subscribe(t.REQ_DRIVE, fifo(10_000))
     async with face.judge("twists", "200") as driver:
         await ready(driver)
@@ -271,7 +271,7 @@ async def timed(face: Face, scene: StandIn) -> dict[str, Any]:
 
 
 def late_joiner(ros: str) -> float:
-    """Milliseconds until map, fixed transforms and description are there."""
+    """Return the time (ms) until map, static transforms and description are received."""
     session = zenoh.open(zenoh.Config.from_json5(json.dumps(session_settings(ros, ""))))
     wanted = {
         "/map": "nav_msgs/msg/OccupancyGrid",
@@ -299,7 +299,7 @@ HOSTILE = 0.2
 
 
 def attack(ros: str, known: bytes, seconds: float) -> int:
-    """Send twists with unknown identities, repeated numbers of a known one and old stamps; returns their number."""
+    """Send twists with unknown identities, repeated numbers of a known one, and old stamps; return their number."""
     key, data = data_key(0, "/cmd_vel", TWIST), encode(TWIST, {"linear": {"x": HOSTILE}})
     session = zenoh.open(zenoh.Config.from_json5(json.dumps(session_settings(ros, ""))))
     random, sent = np.random.default_rng(1), 0
@@ -315,7 +315,7 @@ def attack(ros: str, known: bytes, seconds: float) -> int:
 
 
 async def attacked_by_zenoh(face: Face, driver: asyncio.subprocess.Process, seconds: float) -> int:
-    """Attack under the identity of a driver, among others."""
+    """Attack under the identity of a driver and others."""
     listener = zenoh.open(zenoh.Config.from_json5(json.dumps(session_settings(face.ros, ""))))
     gids: list[bytes] = []
     key = data_key(0, "/cmd_vel", TWIST)
@@ -330,7 +330,7 @@ async def attacked_by_zenoh(face: Face, driver: asyncio.subprocess.Process, seco
 
 
 async def hostile(face: Face, scene: StandIn, seconds: float = 5.0) -> dict[str, Any]:
-    """How many hostile twists reached the robot, sent beside a driver."""
+    """Return the number of hostile twists that reached the robot beside those of a driver."""
     requests = scene.robot.bus.subscribe(t.REQ_DRIVE, fifo(100_000))
     async with face.judge("twists", str(int(seconds * 20))) as driver:
         await ready(driver)
@@ -351,7 +351,7 @@ async def hostile(face: Face, scene: StandIn, seconds: float = 5.0) -> dict[str,
 
 
 async def late(face: Face) -> float:
-    """Milliseconds until a late node has the latched topics."""
+    """Return the time (ms) until a late node has the latched topics."""
     if face.kind == "zenoh":
         return await asyncio.to_thread(late_joiner, face.ros)
     async with face.judge("late") as judge:
@@ -359,7 +359,7 @@ async def late(face: Face) -> float:
 
 
 async def beside_a_stand_in(clock: WallClock, face: Face, seconds: float, folder: Path) -> dict[str, Any]:
-    """All figures of a face that need no devices."""
+    """Return all figures of a face that need no devices."""
     async with stand_in(clock) as scene, face.serving(scene.robot.endpoint) as serving:
         figures = await read_all(face, scene, serving.pid, seconds, folder)
         show(figures)
@@ -371,7 +371,7 @@ async def beside_a_stand_in(clock: WallClock, face: Face, seconds: float, folder
 
 
 def show(figures: dict[str, Any]) -> None:
-    """Print figures as they are known."""
+    """Print figures as they become available."""
     print(json.dumps(figures, default=str), file=sys.stderr, flush=True)
 
 
@@ -379,7 +379,7 @@ def show(figures: dict[str, Any]) -> None:
 
 
 async def held(face: Face, client: TruckClient) -> dict[str, Any]:
-    """Who held the drive during twists, and how long the last message stood."""
+    """Return the holder of the drive during twists, and how long the last message was valid."""
     offset = (await client.get_retained(t.CLOCK)).offset
     gate = client.subscribe(t.GATE, fifo(100_000))
     async with face.judge("twists", "60") as driver:
@@ -394,7 +394,7 @@ async def held(face: Face, client: TruckClient) -> dict[str, Any]:
 
 
 async def ahead(client: TruckClient, *distances: float) -> list[list[float]]:
-    """Poses so far ahead of the robot: m, m, rad."""
+    """Return poses at these distances ahead of the robot: m, m, rad."""
     async for message in client.subscribe(t.POSE, latest()):
         place = message.pose
         break
@@ -402,7 +402,7 @@ async def ahead(client: TruckClient, *distances: float) -> list[list[float]]:
 
 
 async def driven(face: Face, client: TruckClient) -> dict[str, Any]:
-    """Goals by actions, and what else the judge does."""
+    """Run goals by actions, and the judge's other tests."""
     async with kept_armed(client), face.judge("drive") as judge:
         if face.kind == "rclpy":
             return dict(await answered(judge))
@@ -411,7 +411,7 @@ async def driven(face: Face, client: TruckClient) -> dict[str, Any]:
 
 
 async def with_a_robot(clock: WallClock, faces: list[Face], folder: Path) -> dict[str, dict[str, Any]]:
-    """All figures that need a robot that drives, by face."""
+    """Return all figures that need a driving robot, by face."""
     endpoint, found = free_endpoint(), {}
     config = write_overlay(ROOT / "configs" / "explore.yaml", folder, endpoint)
     program = (sys.executable, "-m", "monstertruckd")
@@ -436,7 +436,7 @@ async def with_a_robot(clock: WallClock, faces: list[Face], folder: Path) -> dic
 
 
 async def measure(clock: WallClock, folder: Path, options: argparse.Namespace) -> dict[str, dict[str, Any]]:
-    """All figures by face."""
+    """Return all figures by face."""
     port = free_endpoint().rpartition(":")[2]
     faces = [Face("zenoh", sys.executable, port)]
     faces += [] if options.rclpy is None else [Face("rclpy", options.rclpy, port)]
@@ -452,7 +452,7 @@ async def measure(clock: WallClock, folder: Path, options: argparse.Namespace) -
 
 
 def missed(figures: dict[str, Any]) -> list[str]:
-    """Goals that a face does not meet, or that were not measured."""
+    """Return the goals that a face does not meet, or that were not measured."""
     found = []
     for name, goal in GOALS.items():
         value = figures.get(name)
@@ -465,7 +465,7 @@ def missed(figures: dict[str, Any]) -> list[str]:
 
 
 def main() -> int:
-    """Measure; 0 = all goals are met."""
+    """Measure; 0: all goals are met."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=25.0, help="of reading all topics")
     parser.add_argument("--rclpy", metavar="PYTHON")

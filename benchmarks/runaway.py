@@ -1,14 +1,13 @@
-"""How soon the gate finds a motor that does not obey, and how far the robot gets.
+"""Time until the gate detects a motor that does not obey, and the robot's distance until it stands.
 
     python benchmarks/runaway.py [--seeds 2] [--jobs 2] [--robot NAME ...]
 
-Every drive kind (EPOS with one, two and four shafts, steppers) with every runaway, in every moment that shows it: while
-the robot drives, at rest, after an emergency stop, a stop, a disarm and a lost lease, and at the end of the daemon. The
-whole daemon runs on the virtual clock; the simulated world alone judges. Seconds of the event count from the fault, or
-from the order that it disobeys (a lease takes 0.25 s to expire); the way counts from there, too.
+Every drive kind (EPOS with one, two and four shafts, steppers) with every runaway, at every moment that reveals it:
+while the robot drives, at rest, after an emergency stop, a stop, a disarm and a lost lease, and at the end of the
+daemon. The whole daemon runs on the virtual clock; the simulated world alone judges. Time and distance to the event
+count from the fault, or from the disobeyed order (a lease takes 0.25 s to expire).
 
-A runaway that even the power stage does not stop is stopped by the deadman line, on robots that have it.
-The last line is JSON.
+On robots that have a deadman line, it stops a runaway that even the power stage does not stop. The last line is JSON.
 """
 
 import argparse
@@ -80,7 +79,7 @@ class Case(NamedTuple):
 
 
 def cases(robots: list[str], seeds: int) -> Iterator[Case]:
-    """Every trial that the robots can show."""
+    """Yield every trial that the robots can show."""
     for name in robots:
         epos = ROBOTS[name].role == "drive"
         for runaway, (_, moments) in RUNAWAYS.items():
@@ -103,14 +102,14 @@ def trial(case: Case) -> Outcome:
 
 
 def seconds(case: Case, outcome: Outcome) -> float | None:
-    """Return the time of the event, from when the robot has to stand still (s)."""
+    """Return the time of the event, from when the robot must stand (s)."""
     if outcome.event is None:
         return None
     return max(outcome.event - (LAPSE if case.moment is Moment.LEASE else 0.0), 0.0)
 
 
 def table(rows: list[tuple[Case, Outcome]]) -> None:
-    """Print figures by robot and runaway."""
+    """Print the figures by robot and runaway."""
     print("| robot | runaway | trials | event s, p50 | greatest | safe after it s, greatest | way m, greatest |")
     print("|---|---|---:|---:|---:|---:|---:|")
     for name, runaway in dict.fromkeys((case.robot, case.runaway) for case, _ in rows):
@@ -125,12 +124,12 @@ def table(rows: list[tuple[Case, Outcome]]) -> None:
 
 
 def stopped_by_itself(outcome: Outcome) -> bool:
-    """Whether the line stopped the motor before it had turned further than its orders explain."""
+    """Whether the line stopped the motor before it had turned further than its commands explain."""
     return outcome.safe is not None and outcome.safe <= GOALS["event s, p99"]
 
 
 def figures(rows: list[tuple[Case, Outcome]]) -> dict[str, float]:
-    """What the goals are about; at the daemon's end the power stage is what counts."""
+    """Return the figures of the goals; at the end of the daemon the power stage counts."""
     running = [(case, one) for case, one in rows if case.moment is not Moment.END]
     found = [at for case, one in running if (at := seconds(case, one)) is not None]
     after = [max(one.safe - one.event, 0.0) for _, one in running if one.safe is not None and one.event is not None]
@@ -152,7 +151,7 @@ def figures(rows: list[tuple[Case, Outcome]]) -> dict[str, float]:
 
 
 def main() -> int:
-    """All trials; 0 = the goals are met."""
+    """Run all trials; 0: the goals are met."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--jobs", type=int, default=1)

@@ -1,4 +1,4 @@
-"""The interpreter of the programs we compare ourselves with, so that programs are compared and not builds of Python."""
+"""The interpreter of the compared programs, so that programs are compared and not builds of Python."""
 
 import os
 import subprocess
@@ -11,7 +11,7 @@ SYSTEM_PYTHON: Final = Path("/usr/bin/python3")
 
 
 def can_import(*modules: str) -> bool:
-    """Whether the system's Python finds these, e.g. of Debian's ROS 1."""
+    """Whether the system's Python has these modules, e.g. of Debian's ROS 1."""
     if not SYSTEM_PYTHON.exists():
         return False
     check = [str(SYSTEM_PYTHON), "-c", f"import {', '.join(modules)}"]
@@ -19,7 +19,7 @@ def can_import(*modules: str) -> bool:
 
 
 def go_on_in_the_systems_python() -> None:
-    """Start this program again in the system's Python, with our packages, unless its version is not ours."""
+    """Restart this program in the system's Python, with our packages, if it has our version."""
     if Path(sys.executable).resolve() != SYSTEM_PYTHON.resolve():
         version = [str(SYSTEM_PYTHON), "-c", "import sys; print(*sys.version_info[:2])"]
         answer = subprocess.run(version, capture_output=True, check=False, text=True)

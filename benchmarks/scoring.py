@@ -1,6 +1,6 @@
-"""Estimates, paths and deadlines against the world's truth: the one home of these measures, for all benchmarks.
+"""Errors of estimates, paths and deadlines against the world's truth, shared by all benchmarks.
 
-Poses are (x, y, yaw) in metres and radians; truth is what only the simulated world knows.
+Poses are (x, y, yaw) in metres and radians; only the simulated world knows the truth.
 """
 
 import math
@@ -15,18 +15,18 @@ from monstertruck_planners.collision import DistanceField, Footprint
 
 
 def rms(values: Array) -> float:
-    """Root of the mean square; 0 of none."""
+    """Return the root of the mean square; 0 without values."""
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else 0.0
 
 
 def at(stamps: Array, poses: Array, instants: Array) -> Array:
-    """Poses (m, 3) at instants, s, between those of a trajectory (n, 3): linear, the yaw unwrapped."""
+    """Return poses (m, 3) at instants (s), linearly interpolated in a trajectory (n, 3) with the yaw unwrapped."""
     yaw = np.unwrap(poses[:, 2])
     return np.column_stack([np.interp(instants, stamps, column) for column in (poses[:, 0], poses[:, 1], yaw)])
 
 
 def trajectory(estimate: Array, truth: Array) -> dict[str, float]:
-    """Absolute errors of poses (n, 3) against the true ones of the same instants; nothing is aligned."""
+    """Return the absolute errors of poses (n, 3) against the true ones of the same instants, without alignment."""
     off = np.hypot(*(estimate - truth)[:, :2].T)
     turned = np.abs(np.remainder(estimate[:, 2] - truth[:, 2] + math.pi, math.tau) - math.pi)
     return {
@@ -39,13 +39,13 @@ def trajectory(estimate: Array, truth: Array) -> dict[str, float]:
 
 
 def relative(stamps: Array, estimate: Array, truth: Array, seconds: float) -> float:
-    """RMS error of the motion over so many seconds, m (relative pose error): of every pose (n, 3) that has one later.
+    """Return the RMS error of the motion over a duration, m (relative pose error), of every pose (n, 3) with a later one.
 
     Args:
-        stamps: rising, s.
-        estimate: of those instants.
-        truth: likewise.
-        seconds: over which they are compared.
+        stamps: increasing, s.
+        estimate: estimated poses at those instants.
+        truth: true poses at those instants.
+        seconds: duration.
     """
     later = np.searchsorted(stamps, stamps + seconds)
     first = np.flatnonzero(later < len(stamps))
@@ -58,12 +58,12 @@ def relative(stamps: Array, estimate: Array, truth: Array, seconds: float) -> fl
 
 
 def length(poses: Array) -> float:
-    """Metres along poses (n, >= 2)."""
+    """Return the length along poses (n, >= 2), m."""
     return float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
 
 
 def sharpest(points: Array) -> float:
-    """Greatest curvature of a line of points (n, >= 2), 1/m: its turn at a point over half the pieces beside it."""
+    """Return the maximum curvature of a polyline (n, >= 2), 1/m: turn at a point over half the adjacent pieces."""
     step = np.diff(points[:, :2], axis=0)
     step = step[np.hypot(*step.T) > 1e-6]
     long, turn = np.hypot(*step.T), np.diff(np.unwrap(np.arctan2(step[:, 1], step[:, 0])))
@@ -71,7 +71,7 @@ def sharpest(points: Array) -> float:
 
 
 def distance(places: Array, points: Array) -> Array:
-    """Distances (m,) of places (m, 2) from a polyline (n, 2), m."""
+    """Return the distances (m,) of places (m, 2) from a polyline (n, 2), m."""
     begin, step = points[:-1], np.diff(points, axis=0)
     square = (step**2).sum(axis=1)
     result = np.empty(len(places))
@@ -83,14 +83,14 @@ def distance(places: Array, points: Array) -> Array:
 
 
 def clearance(truth: DistanceField, footprint: Footprint, poses: Array, most: float = 1.0) -> float:
-    """Least distance of the footprint at poses (n, 3) from what is occupied, m, at most ``most``."""
+    """Return the minimum distance of the footprint at poses (n, 3) from occupied cells, m, at most ``most``."""
     return float(truth.clearance(footprint, poses, most).min())
 
 
 def wall_distances(
     cells: NDArray[np.int8], origin: tuple[float, float], resolution: float, truth: DistanceField
 ) -> Array:
-    """Distance of every occupied cell of a grid (rows, columns) from the nearest true wall, m."""
+    """Return the distance of every occupied cell of a grid (rows, columns) from the nearest true wall, m."""
     rows, columns = np.nonzero(cells >= 65)
     middle: Array = (np.column_stack((columns, rows)) + 0.5) * resolution + origin
     return truth.lookup(middle)
@@ -99,10 +99,10 @@ def wall_distances(
 def map_error(
     cells: NDArray[np.int8], origin: tuple[float, float], resolution: float, truth: DistanceField
 ) -> dict[str, float]:
-    """A grid (rows, columns; 100 occupied, 0 free, -1 unknown) against the world.
+    """Compare a grid (rows, columns; 100 occupied, 0 free, -1 unknown) with the world.
 
-    Walls: distance of occupied cells from the nearest true wall, m. ``occupied_free``: share of the cells known as free
-    that lie within a wall by more than a cell.
+    Walls: distance of occupied cells from the nearest true wall, m. ``occupied_free``: share of the free cells that lie
+    within a wall by more than a cell.
     """
     off = wall_distances(cells, origin, resolution, truth)
     rows, columns = np.nonzero((cells >= 0) & (cells < 50))
@@ -119,7 +119,10 @@ def map_error(
 def wall_iou(
     cells: NDArray[np.int8], origin: tuple[float, float], resolution: float, truth: DistanceField, within: float
 ) -> float:
-    """Share in common of the walls of grid and world, both widened by ``within`` m, where the grid knows."""
+    """Return the intersection over union of the walls of grid and world, both widened by ``within`` m.
+
+    Unknown cells of the grid do not count.
+    """
     rows, columns = np.indices(cells.shape)
     middle: Array = (np.column_stack((columns.ravel(), rows.ravel())) + 0.5) * resolution + origin
     true = truth.lookup(middle).reshape(cells.shape) <= within
@@ -129,7 +132,7 @@ def wall_iou(
 
 
 def percentiles(values: Array, unit: str = "ms") -> dict[str, float]:
-    """Median, 99th percentile and greatest value."""
+    """Return median, 99th percentile and maximum."""
     if not len(values):
         return {f"p50_{unit}": 0.0, f"p99_{unit}": 0.0, f"max_{unit}": 0.0}
     p50, p99 = np.percentile(values, (50, 99))
@@ -137,19 +140,19 @@ def percentiles(values: Array, unit: str = "ms") -> dict[str, float]:
 
 
 def missed(instants: Sequence[float], begin: float, end: float, period: float) -> float:
-    """Share of the whole periods from ``begin`` to ``end``, s, within which none of the instants lies."""
+    """Return the share of the whole periods from ``begin`` to ``end`` (s) without any of the instants."""
     edges = begin + period * np.arange(math.floor((end - begin) / period + 1e-9) + 1)
     return float((np.histogram(instants, edges)[0] == 0).mean())
 
 
 def first_miss(share: Callable[[float], float], factors: Sequence[float], allowed: float, ratio: float) -> float:
-    """The factor from which on more than ``allowed`` is missed: to a ``ratio`` above one that keeps up; inf if none is.
+    """Return the factor from which on more than ``allowed`` is missed; inf if none.
 
     Args:
-        share: missed at a factor.
-        factors: rising; the first that misses is looked for among them, then between it and the one before.
+        share: missed share at a factor.
+        factors: increasing; the first that misses is searched among them, then between it and the previous one.
         allowed: share that may be missed.
-        ratio: over 1, between the factor that misses and the greatest tried that does not.
+        ratio: greater than 1, between the factor that misses and the largest tried one that does not.
     """
     keeps = None
     for factor in factors:

@@ -1,10 +1,10 @@
-"""The installed service in a Debian that boots: judged by what its systemd and the emulated truck's wire say.
+"""The installed service in a Debian that boots, judged by its systemd and the emulated truck's wire.
 
     python benchmarks/service.py [--keep FOLDER]
 
 Needs root, Debian's packages and the package index: mmdebstrap makes a minimal Debian, `bootstrap` the program's
-environment inside it, systemd-nspawn boots it (both programs are installed where they are missing). There the service
-is installed, driven, frozen, killed, upgraded, booted again and taken out. Ten minutes.
+environment inside it, systemd-nspawn boots it (both programs are installed if missing). The service is installed,
+driven, frozen, killed, upgraded, booted again and removed. Takes ten minutes.
 """
 
 import argparse
@@ -66,7 +66,7 @@ LEVELS = {name: PRIORITIES[level] for name, level in (("INFO", 20), ("WARNING", 
 
 
 class WireLog:
-    """Reads what the emulated truck writes down, as it grows."""
+    """Reads the emulated truck's growing log."""
 
     def __init__(self, file: Path) -> None:
         self._file = file
@@ -74,7 +74,7 @@ class WireLog:
         self._rows: list[dict[str, Any]] = []
 
     def since(self, instant: float) -> "Wire":
-        """What there is from an instant on, s of CLOCK_MONOTONIC."""
+        """Return the entries from an instant on, s of CLOCK_MONOTONIC."""
         with self._file.open("rb") as stream:
             stream.seek(self._offset)
             whole = stream.read().rpartition(b"\n")[0]
@@ -90,7 +90,7 @@ class WireLog:
 
 @dataclass(frozen=True)
 class Wire:
-    """What passed the wire of the drive, and the true speed."""
+    """Traffic on the wire of the drive, and the true speed."""
 
     to_device: list[tuple[int, bytes]]
     """(ns, bytes)"""
@@ -98,23 +98,23 @@ class Wire:
     """(s, m/s)"""
 
     def reported(self, control: Control) -> float | None:
-        """Instant of the first such control word, s."""
+        """Return the time of the first such control word, s."""
         words = (at for at, index, value in written(self) if (index, value) == (od.CONTROLWORD.index, control))
         return next((at / SECOND for at in words), None)
 
     def stood(self) -> float | None:
-        """Instant of standstill, s."""
+        """Return the time of standstill, s."""
         return next((at for at, speed in self.speeds if abs(speed) < STANDING_SPEED), None)
 
     def metres(self, end: float) -> float:
-        """Travelled until then, m."""
+        """Return the distance travelled until then, m."""
         times = [at for at, _ in self.speeds]
         steps = zip(self.speeds, times[1:], strict=False)
         return sum(abs(v) * (following - at) for (at, v), following in steps if at < end)
 
 
 class Bench:
-    """The machine, the wire, and what was found."""
+    """The machine, the wire, and the results."""
 
     command = f"{PROGRAM}/.venv/bin/monstertruckd"
     """The installed program, inside the machine."""
@@ -127,11 +127,11 @@ class Bench:
         self.missed: list[str] = []
 
     def holds(self, name: str, fact: bool, text: object = "") -> None:
-        """A fact that has to be so."""
+        """Record a required fact."""
         self._judge(name, fact, True, fact, text)
 
     def within(self, name: str, value: float | None, goal: float) -> None:
-        """Seconds that have to be at most so many."""
+        """Record a duration and its limit, s."""
         figure = None if value is None else round(value, 2)
         self._judge(name, figure, goal, value is not None and value <= goal)
 
@@ -146,19 +146,19 @@ class Bench:
         return self.machine.run(f"{folder}/.venv/bin/monstertruckd", *arguments, check=False)
 
     def show(self, *names: str) -> dict[str, str]:
-        """Properties of the service, by systemd."""
+        """Return properties of the service from systemd."""
         return self.machine.show(SERVICE, *names)
 
     def active(self) -> bool:
-        """Whether systemd has got READY."""
+        """Whether systemd has received READY."""
         return self.show("ActiveState")["ActiveState"] == "active"
 
     def exec_start(self) -> str:
-        """What the unit runs."""
+        """Return the command of the unit."""
         return self.show("ExecStart")["ExecStart"]
 
     def drive(self) -> bool:
-        """Begin at the start of the lap and drive; whether it does."""
+        """Start the lap and drive; return whether it drives."""
         self.machine.run("systemctl", "stop", SERVICE)
         self.machine.run("systemctl", "restart", "emulated.service")
         if not until(lambda: self.machine.run("test", "-e", "/dev/truck/compass", check=False).returncode == 0, 30):
@@ -175,13 +175,13 @@ class Bench:
         return bool(speeds) and abs(speeds[-1][1]) > SPEED
 
     def journal(self, since: float) -> list[dict[str, Any]]:
-        """Entries of the service and of systemd on it, from an instant on, s of CLOCK_MONOTONIC."""
+        """Return the entries of the service, and of systemd about it, from an instant on, s of CLOCK_MONOTONIC."""
         lines = self.machine.run("journalctl", f"--unit={SERVICE}", "--output=json", "--boot", "--all").stdout
         entries = [json.loads(line) for line in lines.splitlines()]
         return [entry for entry in entries if int(entry["__MONOTONIC_TIMESTAMP"]) >= since * 1e6]
 
     def dies(self, name: str, action: Callable[[], object], *, says: tuple[str, ...], restarts: bool = True) -> None:
-        """Something ends the daemon of a driving truck: the wire gets the stop, the journal why, it runs again."""
+        """End the daemon of a driving truck; check the stop on the wire, the cause in the journal, and the restart."""
         if not self.drive():
             self.holds(f"{name}_drives", fact=False, text=self.machine.run("systemctl", "status", SERVICE, check=False))
             return
@@ -227,7 +227,7 @@ def install(bench: Bench) -> None:
 
 
 def sandbox(bench: Bench) -> None:
-    """What the kernel says of the running daemon."""
+    """Check the running daemon's restrictions in the kernel."""
     pid = bench.show("MainPID")["MainPID"]
     status = bench.machine.run("cat", f"/proc/{pid}/status").stdout
     facts = dict(line.split(":\t", 1) for line in status.splitlines() if ":\t" in line)
@@ -246,7 +246,7 @@ def sandbox(bench: Bench) -> None:
 
 
 def ready_after_tick(bench: Bench) -> None:
-    """By the daemon's log: the gate's first state is older than systemd's READY."""
+    """Check in the daemon's log that the gate's first state is older than systemd's READY."""
     started = int(bench.show("ActiveEnterTimestampMonotonic")["ActiveEnterTimestampMonotonic"]) * 1000
     forked = int(bench.show("ExecMainStartTimestampMonotonic")["ExecMainStartTimestampMonotonic"]) * 1000
     bench.machine.run("systemctl", "stop", SERVICE)
@@ -283,7 +283,7 @@ def deaths(bench: Bench) -> None:
 
 
 def priorities(bench: Bench, since: float) -> None:
-    """Every line of the daemon's log has the priority of its level."""
+    """Check that every line of the daemon's log has the priority of its level."""
     seen: dict[str, set[str]] = {}
     for entry in bench.journal(since):
         level = str(entry.get("MESSAGE", "")).split(" ")[0]
@@ -340,7 +340,7 @@ def _edit(root: Path, name: str, before: str, after: str) -> None:
 
 
 def second_boot(bench: Bench) -> None:
-    """After a power-on nobody does anything."""
+    """Check that the truck stays at rest after a power-on."""
     bench.holds("active_after_boot", until(bench.active, 60))
     stamps = bench.machine.show("", "UserspaceTimestampMonotonic") | bench.show("ActiveEnterTimestampMonotonic")
     began, ready = (int(stamps[f"{name}TimestampMonotonic"]) / 1e6 for name in ("Userspace", "ActiveEnter"))
@@ -372,7 +372,7 @@ def uninstall(bench: Bench) -> None:
 
 
 def versions(machine: Machine) -> None:
-    """Put this tree's files into the machine, three times, each with its environment."""
+    """Copy this tree into the machine, three times, each with its environment."""
     for folder in (PROGRAM, NEXT, NEVER):
         checkout(machine, folder)
     place = machine.root / PROGRAM.relative_to("/")
@@ -381,7 +381,7 @@ def versions(machine: Machine) -> None:
 
 
 def checkout(machine: Machine, folder: Path) -> None:
-    """Put this tree's files into a folder of the machine, with their environment."""
+    """Copy this tree into a folder of the machine, with its environment."""
     caches = {
         Path.home() / ".cache" / "uv": "/root/.cache/uv",
         Path(find_uv()).parent: "/root/.cache/monstertruckd",
@@ -394,7 +394,7 @@ def checkout(machine: Machine, folder: Path) -> None:
 
 
 def copy_tree(place: Path) -> None:
-    """Copy what git knows of this tree, uncommitted changes included."""
+    """Copy the files of this tree known to git, including uncommitted changes."""
     place.mkdir(parents=True, exist_ok=True)
     listed = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     names = subprocess.run(listed, cwd=ROOT, capture_output=True, check=True).stdout
@@ -411,7 +411,7 @@ def freezable(environment: Path) -> None:
 
 
 def emulated_truck(machine: Machine, folder: Path) -> None:
-    """Start the truck behind /dev/truck with the machine, by the checkout in a folder of it."""
+    """Start the truck behind /dev/truck together with the machine, by the checkout in one of its folders."""
     place = machine.root / folder.relative_to("/")
     (place / "configs/truck-of-the-benchmark.yaml").write_text(TRUCK)
     unit = machine.root / "etc/systemd/system/emulated.service"
@@ -423,10 +423,10 @@ def emulated_truck(machine: Machine, folder: Path) -> None:
 
 
 def run(bench: Bench) -> None:
-    """All of it.
+    """Run all stages.
 
     Raises:
-        NotBootedError: what stopped it.
+        NotBootedError: the machine did not boot; the text is the cause.
     """
     install_tools()
     began = monotonic()
@@ -444,13 +444,13 @@ def run(bench: Bench) -> None:
 
 
 def judged(name: str, kind: type[AnyBench], keep: Path | None, run: Callable[[AnyBench, Path], None]) -> int:
-    """Run a benchmark of the machine, print and write its result; 0 if every goal is met.
+    """Run a benchmark of the machine, print and write its result; return 0 if all goals are met.
 
     Args:
-        name: Name of the benchmark.
-        kind: Class of its bench.
-        keep: Folder that keeps the machine; None for one that is removed.
-        run: Runs all of it, with a scratch folder; may raise ``NotBootedError``.
+        name: name of the benchmark.
+        kind: class of its bench.
+        keep: folder that keeps the machine; None: it is removed.
+        run: runs all of it, with a scratch folder; may raise ``NotBootedError``.
     """
     with TemporaryDirectory(prefix=f"{name}-", dir="/var/tmp") as scratch:
         folder = keep or Path(scratch)
@@ -474,7 +474,7 @@ def judged(name: str, kind: type[AnyBench], keep: Path | None, run: Callable[[An
 
 
 def main() -> int:
-    """All stages; 0 = every goal is met."""
+    """Run all stages; 0: all goals are met."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--keep", type=Path, help="leave what is built in this folder, and use what is there already")
     return judged("service", Bench, parser.parse_args().keep, lambda bench, _: run(bench))

@@ -5,9 +5,9 @@
 For each seed the world draws turning centres, effective radii, unequal wheels, a slide of the circle's centre and a
 turn at each reversal; the daemon drives a circle and passes to and fro, open loop, and its log is analysed.
 ``--figures FOLDER`` drives the paper's seven circles and its line instead, and draws its figures 6 to 15. ``--stand``
-drives these, too, and has six rendered cameras over the table, hidden and calibrated as in ``stand.py``, measure them
-by a tag of 80 mm on the robot, 10 pictures a second of each that sees it: the table by the stand against that by the
-world's truth.
+drives these, too, and measures them with six rendered cameras over the table, hidden and calibrated as in ``stand.py``,
+by a tag of 80 mm on the robot, at 10 images a second of each camera that sees it: the table by the stand is compared
+with that by the world's truth.
 """
 
 import argparse
@@ -86,7 +86,7 @@ def robot(truth: dict[str, Any], seed: int, logs: Path) -> SimulatedTruckConfig:
 
 
 def drive(config: SimulatedTruckConfig, plans: Sequence[list[runs.Stretch]]) -> None:
-    """Drive plans one after the other, each from the start that suits it."""
+    """Drive plans one after the other, each from a suitable start."""
 
     async def main(clock: VirtualClock) -> None:
         rig = VirtualRig(config, clock)
@@ -108,7 +108,7 @@ def analysed(folder: Path) -> list[report.Result]:
 
 
 def expected(config: SimulatedTruckConfig, left: float, right: float) -> tuple[float, float]:
-    """True radius and speed of the robot's middle at wheel rates."""
+    """Return the true radius and speed of the robot's centre at given wheel rates."""
     truck = config.sim.world.truck
     speeds = np.array([left, right, left, right]) * truck.wheel_radius * np.array(truck.skid.wheel_gains)
     vx, vy, wz = truck.chassis().twist(tuple(speeds.tolist()))
@@ -149,7 +149,7 @@ def paper_plans(config: SimulatedTruckConfig) -> list[list[runs.Stretch]]:
 
 
 def figures(folder: Path) -> None:
-    """The paper's runs in a world much like its own, the table, and its figures."""
+    """Drive the paper's runs in a world much like its own, and draw its table and figures."""
     with TemporaryDirectory() as logs:
         config = robot(PAPER_LIKE, 1, Path(logs))
         drive(config, paper_plans(config))
@@ -165,7 +165,7 @@ def figures(folder: Path) -> None:
 
 
 def seen(run: Run, stand: Any) -> Run:
-    """A run whose poses are those that the stand's cameras measure."""
+    """Return a run with the poses measured by the stand's cameras."""
     hidden, config, found, renderers, _ = stand
     track = StandTracker(found.placed(), config.robots, config.marks)
     readers = {name: StandReader(config.marks, (), tagged=True, phase=k) for k, name in enumerate(renderers)}
@@ -185,7 +185,7 @@ def seen(run: Run, stand: Any) -> Run:
 
 
 def by_stand() -> int:
-    """Compare the paper's table as the stand measures it with the simulated truth; return 0 if all goals are met."""
+    """Compare the paper's table as measured by the stand with the simulated truth; return 0 if all goals are met."""
     with TemporaryDirectory() as logs:
         config = with_overlay(robot(PAPER_LIKE, 1, Path(logs)), {"sim": {"world": {"noise": False}}})
         drive(config, paper_plans(config))

@@ -41,14 +41,14 @@ Sample = tuple[float, float, int]
 
 
 def now_used(minute: float, known: int) -> Sample:
-    """Minute, resident memory in MB less ``known`` bytes, open file descriptors."""
+    """Return the minute, resident memory in MB minus ``known`` bytes, and open file descriptors."""
     gc.collect()
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     return minute, (pages * os.sysconf("SC_PAGE_SIZE") - known) / 1e6, sum(1 for _ in Path("/proc/self/fd").iterdir())
 
 
 async def soak(clock: VirtualClock, config: SimulatedTruckConfig, minutes: int, seed: int) -> tuple[list[Sample], int]:
-    """Samples, one a minute, and how often something was replugged."""
+    """Return samples, one a minute, and the number of replugged devices."""
     rng = np.random.default_rng(seed)
     rig = VirtualRig(config, clock)
     samples: list[Sample] = []
@@ -97,7 +97,7 @@ async def _replug(rig: VirtualRig, rng: np.random.Generator) -> None:
 
 
 def main() -> int:
-    """Soak; 0 = flat."""
+    """Soak; 0: flat."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=int, default=60)
     parser.add_argument("--seed", type=int, default=1)

@@ -1,7 +1,7 @@
-"""How level the lidar stays on a rocking truck: through compass, planner, driver and both emulated AX-12A, and without.
+"""Levelling of the lidar on a rocking truck: with compass, planner, driver and both emulated AX-12A, and without.
 
-Prints the true tilt of the lidar with the stabiliser on and off, and what the daemon says about its scans; draws the
-map of a lap on the rocking truck both ways into docs/pictures. The last line is JSON.
+Prints the true tilt of the lidar with the stabiliser on and off, and the tilt stated by the daemon in its scans; draws
+the map of a lap on the rocking truck both ways into docs/pictures. The last line is JSON.
 
     python benchmarks/stabiliser.py [--quick]      (quick: no pictures)
 """
@@ -41,7 +41,7 @@ def ramp(*overlays: dict[str, Any]) -> SimulatedTruckConfig:
 
 
 def tilts(config: SimulatedTruckConfig, seconds: float = SECONDS) -> dict[str, float]:
-    """RMS and greatest true tilt of the lidar, and error of the tilt stated in its scans, degrees."""
+    """Return RMS and maximum true tilt of the lidar, and error of the tilt stated in its scans, degrees."""
 
     async def main(clock: VirtualClock) -> dict[str, float]:
         rig = VirtualRig(config, clock)
@@ -85,7 +85,7 @@ def tilts(config: SimulatedTruckConfig, seconds: float = SECONDS) -> dict[str, f
 
 
 def draw_map(config: SimulatedTruckConfig) -> str:
-    """Drive a lap; the map's picture is saved by the daemon itself."""
+    """Drive a lap; the daemon saves the picture of the map."""
 
     async def main(clock: VirtualClock) -> str:
         rig = VirtualRig(config, clock)

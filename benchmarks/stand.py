@@ -1,14 +1,14 @@
-"""The overhead stand on rendered pictures: accuracy over the table, hand-over, frames a second, identities, faults.
+"""The overhead stand on rendered images: accuracy over the table, hand-over, frame rate, identities, faults.
 
     python -m benchmarks.stand [--seeds 2] [--poses 60] [--crossing 10] [--minutes 10]
 
 Six cameras of 640 x 480 with hidden lenses and places over a table of 3 m x 3 m, calibrated by the stand's own
-procedure from rendered boards and marks that a ruler measured to 1.5 mm; blur, noise and distortion as in
-``tests/stand_kit.py``. Rendering is not counted in the frames a second: JPEGs are decoded, read and tracked, first one
-after the other, which gives a core's time for a picture, then once more as ``stand track`` does, on all cores, which
-gives the pictures a second of each camera that the computer really did. Robots carry a tag, or two coloured discs:
-then all five have the same colours. ``--minutes`` of five of them crossing are not rendered: discs are found to 0.2
-pixels, one in fifty is missed, and one picture in fifty shows a disc too much.
+procedure from rendered boards and marks measured with a ruler to 1.5 mm; blur, noise and distortion as in
+``tests/stand_kit.py``. Rendering does not count in the frame rate: JPEGs are decoded, read and tracked, first one after
+the other, which gives a core's time for an image, then as by ``stand track``, on all cores, which gives the achieved
+images per second of each camera. Robots carry a tag, or two coloured discs, with the same colours on all five. The
+``--minutes`` of five crossing robots are not rendered: discs are found to 0.2 pixels, one in fifty is missed, and one
+image in fifty shows an additional disc.
 """
 
 import argparse
@@ -71,12 +71,12 @@ ROOM = 0.25
 
 
 def discs(count: int, starts: Any) -> dict[str, BlobRobot]:
-    """Robots that look alike, and where they begin."""
+    """Return robots that look alike, and their starts."""
     return {f"r{k + 1}": BlobRobot(front=LOOK[0], rear=LOOK[1], apart=APART, start=starts[k]) for k in range(count)}
 
 
 def marker(stand: Any, kind: str, number: int, x: float, y: float, yaw: float) -> Any:
-    """What a robot carries."""
+    """Return the marker of a robot."""
     if kind == "tags":
         return level_tag(number, stand[1].mark_size, x, y, yaw, 0.08)
     return disc_plate(*LOOK, x, y, yaw, apart=APART)
@@ -91,7 +91,7 @@ def tracker(stand: Any, kind: str, starts: Any) -> StandTracker:
 
 
 def readers(stand: Any, kind: str) -> dict[str, StandReader]:
-    """By camera, as the stand reads."""
+    """Return the stand's readers, by camera."""
     tags = kind == "tags"
     return {
         name: StandReader(stand[1].marks, () if tags else LOOK, tagged=tags, phase=k) for k, name in enumerate(stand[3])
@@ -101,7 +101,7 @@ def readers(stand: Any, kind: str) -> dict[str, StandReader]:
 def accuracy(
     stand: Any, kind: str, poses: int, rng: np.random.Generator, look: PictureQuality | None
 ) -> tuple[list[float], list[float]]:
-    """Errors of position, m, and heading, rad, of a marker at random places."""
+    """Return the errors of position (m) and heading (rad) of a marker at random places."""
     _, _, _, renderers, floor = stand
     off, turned_by = [], []
     for _ in range(poses):
@@ -116,7 +116,7 @@ def accuracy(
 
 
 def hand_over(stand: Any, kind: str) -> float:
-    """Greatest jump, m, beyond the way driven, of a robot that crosses all views in steps of 20 mm."""
+    """Return the largest jump (m) beyond the distance driven of a robot that crosses all views in steps of 20 mm."""
     _, _, _, renderers, floor = stand
     ways = np.arange(-1.3, 1.3, 0.02)
     track, reading = tracker(stand, kind, [(-1.3, 0.4 * math.sin(-2.6))]), readers(stand, kind)
@@ -136,7 +136,7 @@ def hand_over(stand: Any, kind: str) -> float:
 
 
 def crossing_ways(rng: np.random.Generator, count: int = 5) -> Callable[[float], Array]:
-    """Closed ways over the table that cross each other, without robots that meet; from time, s, to (count, 3)."""
+    """Return closed paths that cross each other, on which robots never meet; from time (s) to (count, 3)."""
     times = np.arange(0.0, PERIOD, 0.02)
     found = np.empty((0, 6))
     while len(found) < count:
@@ -158,7 +158,7 @@ def _along(way: Array, times: Array) -> Array:
 
 
 class Crossing(NamedTuple):
-    """What robots that cross came to."""
+    """Result of crossing robots."""
 
     lost: int
     """Poses that are another robot's."""
@@ -175,13 +175,13 @@ class Crossing(NamedTuple):
 
 
 def crossing(stand: Any, kind: str, seconds: float, rng: np.random.Generator) -> Crossing:
-    """Five robots that cross.
+    """Let five robots cross.
 
     Args:
-        stand: calibrated.
-        kind: of marker.
-        seconds: how long; a minute takes some minutes to render.
-        rng: of their ways.
+        stand: calibrated stand.
+        kind: kind of marker.
+        seconds: duration; a minute takes some minutes to render.
+        rng: random numbers of their paths.
     """
     _, _, _, renderers, floor = stand
     where = crossing_ways(rng)
@@ -222,10 +222,10 @@ def crossing(stand: Any, kind: str, seconds: float, rng: np.random.Generator) ->
 
 
 class Watch:
-    """Counts poses that are another robot's, and how long robots are not seen.
+    """Counts poses of confused robots, and the longest times without a pose.
 
     Args:
-        count: of robots.
+        count: number of robots.
     """
 
     def __init__(self, count: int) -> None:
@@ -233,7 +233,7 @@ class Watch:
         self._seen_at = [0.0] * count
 
     def take(self, now: float, poses: Sequence[RobotPose], true: Array) -> None:
-        """Poses of one instant, s, and what they should be."""
+        """Compare the poses of one instant (s) with the true ones."""
         by_name = {pose.robot: pose for pose in poses}
         for i, (x, y, _) in enumerate(true):
             pose = by_name.get(f"r{i + 1}")
@@ -246,7 +246,7 @@ class Watch:
 
 
 def long_crossing(stand: Any, minutes: float, rng: np.random.Generator) -> tuple[int, float]:
-    """The same with discs, found and not rendered: poses that are another robot's, and the longest time unseen, s."""
+    """Let discs cross without rendering; return the number of confused poses and the longest time unseen, s."""
     hidden, _, _, _, _ = stand
     where = crossing_ways(rng)
     track, watch = tracker(stand, "discs", [(x, y) for x, y, _ in where(0.0)]), Watch(5)
@@ -270,10 +270,10 @@ def _found_discs(camera: PlacedCamera, true: Array, rng: np.random.Generator) ->
 
 
 def faults(stand: Any, seed: int) -> tuple[float, float, int]:
-    """A camera turned by 2 degrees, about each of its axes, and another one unplugged.
+    """Turn a camera by 2 degrees about each of its axes, and unplug another one.
 
     Returns:
-        Longest times until either is named, s, and how many others are.
+        Longest times until each is named (s), and the number of others named.
     """
     hidden, config, found, renderers, floor = stand
     good = {name: renderer.picture(floor) for name, renderer in renderers.items()}
@@ -303,7 +303,7 @@ def rms(errors: Sequence[float]) -> float:
 
 
 def main() -> int:
-    """Measure; 0 = all goals are met."""
+    """Measure; 0: all goals are met."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--poses", type=int, default=60)
@@ -333,7 +333,7 @@ def main() -> int:
 
 
 def measured(stands: Sequence[Any], kind: str, poses: int, seconds: float) -> dict[str, Any]:
-    """Figures of one kind of marker."""
+    """Return the figures of one kind of marker."""
     off, turned_by, dim, jumps, crossed = [], [], [], [], []
     for seed, stand in enumerate(stands):
         rng = np.random.default_rng([seed, 9])

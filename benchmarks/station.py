@@ -1,13 +1,13 @@
-"""What the station costs: processor time and bytes for each browser, first picture, and the way of an emergency stop.
+"""Cost of the station: processor time and bytes for each browser, first picture, and latency of an emergency stop.
 
     python -m benchmarks.station [--seconds S] [--quick]
     python -m benchmarks.station --memory [--hours 2]
 
-A robot that only publishes (``station_parts/published.py``: 10 Hz scans, 2 Hz map of 400 x 400 cells, 15 Hz pictures)
-and a station, each a process. Browsers are WebSocket clients that fetch every map as the page does; one more never
-reads. The first picture is taken in Debian's chromium, where there is one. The emergency stop is timed from the
-WebSocket message to the request on the robot's bus. ``--memory``: the messages of so many hours, sent eight times as
-fast, with a browser that reads them; how much the station's memory grows behind the first quarter.
+A robot that only publishes (``station_parts/published.py``: 10 Hz scans, 2 Hz map of 400 x 400 cells, 15 Hz images) and
+a station run as processes. Browsers are WebSocket clients that fetch every map like the page; one more never reads. The
+first picture is measured in Debian's chromium if installed. The emergency stop is timed from the WebSocket message to
+the request on the robot's bus. ``--memory``: growth of the station's memory after the first quarter, over the messages
+of so many hours, sent eight times as fast, with a browser that reads them.
 """
 
 import argparse
@@ -83,13 +83,13 @@ class Counted:
 
 
 def cpu(pid: int) -> float:
-    """Processor seconds of a process."""
+    """Return the processor time (s) of a process."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / TICKS
 
 
 async def spawned(*command: str, ready: str) -> asyncio.subprocess.Process:
-    """A process, once it has said ``ready``."""
+    """Return a process once it has printed ``ready``."""
     pipe = asyncio.subprocess.PIPE
     process = await asyncio.create_subprocess_exec(
         sys.executable, "-m", *command, cwd=ROOT, stdout=pipe, stderr=asyncio.subprocess.STDOUT
@@ -101,7 +101,7 @@ async def spawned(*command: str, ready: str) -> asyncio.subprocess.Process:
 
 
 async def ended(process: asyncio.subprocess.Process) -> None:
-    """End a process of ours."""
+    """End a child process."""
     with contextlib.suppress(ProcessLookupError):
         process.terminate()
     await process.communicate()
@@ -109,7 +109,7 @@ async def ended(process: asyncio.subprocess.Process) -> None:
 
 @asynccontextmanager
 async def browsers(url: str, count: int) -> AsyncIterator[list[Counted]]:
-    """So many that read."""
+    """Run this many reading browsers."""
     async with aiohttp.ClientSession() as session:
         made = [Counted(session, url) for _ in range(count)]
         jobs = [asyncio.create_task(each.run()) for each in made]
@@ -122,7 +122,7 @@ async def browsers(url: str, count: int) -> AsyncIterator[list[Counted]]:
 
 
 async def load(url: str, pid: int, count: int, seconds: float) -> dict[str, float]:
-    """Costs of so many browsers."""
+    """Return the costs of this many browsers."""
     async with browsers(url, count) as made:
         await asyncio.sleep(3.0)
         before, began = cpu(pid), time.monotonic()
@@ -144,7 +144,7 @@ async def load(url: str, pid: int, count: int, seconds: float) -> dict[str, floa
 
 
 async def beside_a_frozen_one(url: str, pid: int, seconds: float) -> dict[str, float]:
-    """Costs of one browser beside another that never reads."""
+    """Return the costs of one browser beside another that never reads."""
     async with aiohttp.ClientSession() as session:
         frozen = await session.ws_connect(f"{url}socket", origin=url[:-1])
         await frozen.send_json({"do": "watch", "robot": "truck"})
@@ -156,7 +156,7 @@ async def beside_a_frozen_one(url: str, pid: int, seconds: float) -> dict[str, f
 
 
 async def estops(url: str, robot: asyncio.subprocess.Process, count: int) -> dict[str, float]:
-    """Delays from a message on the WebSocket to the request on the robot's bus, ms."""
+    """Return the delays from a message on the WebSocket to the request on the robot's bus, ms."""
     assert robot.stdout is not None
     delays = []
     async with aiohttp.ClientSession() as session, session.ws_connect(f"{url}socket", origin=url[:-1]) as socket:
@@ -181,7 +181,7 @@ async def _read(socket: aiohttp.ClientWebSocketResponse) -> None:
 
 
 async def first_pictures(url: str, count: int) -> list[float]:
-    """Seconds from opening the page to the gate's state on it, each in a fresh profile."""
+    """Return the seconds from opening the page to the gate's state on it, each in a fresh profile."""
     times = []
     with TemporaryDirectory() as folder:
         async with chromium(Path(folder)) as browser:
@@ -196,13 +196,13 @@ async def first_pictures(url: str, count: int) -> list[float]:
 
 
 def resident(pid: int) -> float:
-    """Memory of a process, MB."""
+    """Return the memory of a process, MB."""
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 async def memory(hours: float) -> int:
-    """How the station's memory grows over the messages of so many hours."""
+    """Measure the growth of the station's memory over the messages of some hours."""
     endpoint = free_endpoint()
     port = free_endpoint().rpartition(":")[2]
     url = Place(port=int(port)).url
@@ -236,7 +236,7 @@ async def memory(hours: float) -> int:
 
 
 async def main(seconds: float, presses: int) -> int:
-    """Everything."""
+    """Run all measurements."""
     endpoint = free_endpoint()
     port = free_endpoint().rpartition(":")[2]
     url = Place(port=int(port)).url

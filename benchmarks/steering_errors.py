@@ -90,7 +90,7 @@ class FaultyPlant:
     """Where the play has left the front axle, rad."""
 
     def step(self, front: float, rear: float) -> None:
-        """One step with these requests."""
+        """Execute one step with these requests."""
         plant, fault = self.plant, self.fault
         plant.turn(front, rear)
         play = 0.5 * fault.backlash
@@ -104,7 +104,7 @@ class FaultyPlant:
 
 @dataclass
 class Drive:
-    """A tracker that drives a course lap after lap, with what it has learnt."""
+    """A tracker that drives a course lap after lap, and keeps what it has learnt."""
 
     tracker: PathTracker[Any]
     points: np.ndarray
@@ -159,14 +159,14 @@ class Drive:
 
 
 def tracker_of(kind: str, speed: float, rate: float, **more: float) -> PathTracker[Any]:
-    """A tracker with the settings of the part ``tracking``; dead time and lag are left to be learnt."""
+    """Return a tracker with the settings of the part ``tracking``; it must learn dead time and lag."""
     settings = {"speed": speed, "reverse_speed": speed, "min_speed": 0.05, "deceleration": 0.5, "acceleration": 1.0}
     axle = {"angle": LIMIT, "steering": "front", "steering_rate": rate, "rate": 1 / PERIOD}
     return build_tracker(ADAPTER.validate_python({**settings, **axle, **KINDS[kind], **more}), YARDSTICK)
 
 
 def learn(run: Drive, each: Callable[[Drive], None] = lambda _: None) -> tuple[float, float]:
-    """Laps until ``LEARNING`` metres are driven, and one more; RMS errors on the way and after, mm."""
+    """Drive laps until ``LEARNING`` metres are driven, and one more; return the RMS errors during and after, mm."""
     while run.metres < LEARNING:
         run.lap(each)
     after = run.metres
@@ -176,7 +176,7 @@ def learn(run: Drive, each: Callable[[Drive], None] = lambda _: None) -> tuple[f
 
 
 def errors(figures: dict[str, float], goals: dict[str, float]) -> None:
-    """Every fault on every course."""
+    """Drive every course with every fault."""
     courses = built_in()
     print(f"{'':20}{'RMS mm in 10 m':>16}{'after':>8}{'over clean':>12}{'after':>8}")
     for kind in TRACKERS:
@@ -199,7 +199,7 @@ def errors(figures: dict[str, float], goals: dict[str, float]) -> None:
 
 
 def first_report(run: Drive) -> tuple[float, str]:
-    """Metres driven at the first report, and its text; infinite and empty if there is none."""
+    """Return the distance at the first report (m), and its text; infinite and empty if there is none."""
     found: list[tuple[float, str]] = []
 
     def look(drive: Drive) -> None:
@@ -213,7 +213,7 @@ def first_report(run: Drive) -> tuple[float, str]:
 
 
 def reports(figures: dict[str, float], goals: dict[str, float], seeds: int) -> None:
-    """Distance to the first report of every fault, and reports of clean runs."""
+    """Measure the distance to the first report of every fault, and count reports of clean runs."""
     courses, wrong = built_in(), 0
     for course, speed in COURSES:
         for name in REPORTED:
@@ -237,7 +237,7 @@ def reports(figures: dict[str, float], goals: dict[str, float], seeds: int) -> N
 
 
 def latency(figures: dict[str, float], goals: dict[str, float]) -> None:
-    """A delay that has to be learnt, against one that is configured."""
+    """Compare a delay that must be learnt with one that is configured."""
     dead_time, lag, rate = LATE
     for course, speed in COURSES:
         known = tracker_of("lqr", speed, rate, dead_time=dead_time, lag=lag)
@@ -252,7 +252,7 @@ def latency(figures: dict[str, float], goals: dict[str, float]) -> None:
 
 
 def main() -> int:
-    """Run the parts; 1 if a goal is not met."""
+    """Run the parts; 1: a goal is not met."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--part", choices=PARTS, help="only this part")
     parser.add_argument("--seeds", type=int, default=50, help="clean runs of the part reports")

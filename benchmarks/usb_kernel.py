@@ -1,12 +1,12 @@
-"""Serial ports, hubs and udev on a Debian kernel that runs in QEMU: what no pty and no emulator shows.
+"""Serial ports, hubs and udev on a Debian kernel in QEMU: behaviour that no pty and no emulator shows.
 
     python benchmarks/usb_kernel.py [--keep FOLDER]
 
 Needs Debian's packages qemu-system-x86, busybox-static and udev, and the package index for linux-image-amd64, which is
-downloaded and unpacked, not installed; where they are missing the run is skipped, and says so. The machine has two
-hubs, three FTDI adapters, a CDC-ACM device whose other side the machine holds, and a joystick; its file system is
-this computer's, read-only. Some three minutes without KVM. Times of the machine are no latencies: what is judged of
-the event loop is how long its calls sleep in the kernel, as the kernel traces them.
+downloaded and unpacked, not installed; without them the run is skipped with a message. The machine has two hubs, three
+FTDI adapters, a CDC-ACM device whose device side runs in the machine, and a joystick; its file system is this
+computer's, read-only. Takes some three minutes without KVM. The machine's times are no latencies: the event loop is
+judged by how long its calls sleep in the kernel, from kernel traces.
 """
 
 import argparse
@@ -37,7 +37,7 @@ GOAL_MS = 2.0
 
 
 async def drive(path: Path) -> None:
-    """An EPOS at the far end of an adapter's line."""
+    """Emulate an EPOS at the far end of an adapter's line."""
     end = DeviceEnd("drive")
     reader, writer = await asyncio.open_unix_connection(str(path))
     end.connect(writer.write)
@@ -49,7 +49,7 @@ async def drive(path: Path) -> None:
 
 
 def serve_drive(path: Path) -> None:
-    """In a thread of its own, until the machine ends."""
+    """Run in a thread until the machine ends."""
 
     async def connected() -> None:
         while True:
@@ -62,7 +62,7 @@ def serve_drive(path: Path) -> None:
 
 
 def swallow(path: Path) -> None:
-    """The far end of a line that only listens."""
+    """Read the far end of a line without answers."""
 
     def run() -> None:
         line = socket.socket(socket.AF_UNIX)
@@ -76,7 +76,7 @@ def swallow(path: Path) -> None:
 
 
 def measure(folder: Path) -> dict[str, Any]:
-    """Boot, run every situation, collect.
+    """Boot, run every situation, collect the results.
 
     Raises:
         MissingError: the machine cannot be made here.

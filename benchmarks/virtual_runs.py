@@ -1,4 +1,4 @@
-"""Goals and behaviours that benchmarks run on the virtual clock to their end."""
+"""Goals and behaviours that benchmarks run to their end on the virtual clock."""
 
 import contextlib
 from typing import Any
@@ -37,7 +37,7 @@ async def behaviour_run(
     Args:
         config: configuration of the simulated robot.
         name: name of the behaviour.
-        clock: time.
+        clock: source of time.
         settle: time before the robot is armed, s.
         limit: maximum time of the behaviour, s.
 

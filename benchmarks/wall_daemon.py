@@ -37,7 +37,7 @@ GOALS: Final = {"contacts": 0, "unfinished": 0, "tuned steady_mm": 6.0}
 
 
 def laps(model: str, seeds: int, pool: ProcessPoolExecutor) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Figures of every method."""
+    """Return the figures of every method."""
     arena = study()
     for method, behaviour in METHODS.items():
         jobs = [(behaviour, SIDES[seed % 2], seed, model) for seed in range(seeds)]
@@ -60,7 +60,7 @@ def laps(model: str, seeds: int, pool: ProcessPoolExecutor) -> Iterator[tuple[st
 
 
 def tuning(model: str, seed: int, figure: Path | None) -> dict[str, Any]:
-    """What the recipe finds."""
+    """Return the result of the recipe."""
     best, runs = tuned(seed, FIRST, model, lambda run: print(f"    {run.text}", flush=True))
     if figure is not None:
         draw(runs, figure)
@@ -75,7 +75,7 @@ def tuning(model: str, seed: int, figure: Path | None) -> dict[str, Any]:
 
 
 def faults(seeds: int, seconds: float, pool: ProcessPoolExecutor) -> dict[str, Any]:
-    """Figures of robots whose devices break."""
+    """Return the figures of robots with device faults."""
     jobs = [(SIDES[seed % 2], seed, seconds) for seed in range(seeds)]
     runs: list[FaultRun] = list(pool.map(broken, *zip(*jobs, strict=True)))
     return {

@@ -94,7 +94,7 @@ class Job(NamedTuple):
 
 
 class Result(NamedTuple):
-    """What is kept of it."""
+    """Saved values of a run."""
 
     job: Job
     run: WallRun
@@ -105,7 +105,7 @@ class Result(NamedTuple):
 
 
 def pilot(method: str, model: str, side: str, lap: dict[str, float]) -> tuple[Behaviour, float]:
-    """The behaviour of a method and its steps a second."""
+    """Return the behaviour of a method, and its rate (1/s)."""
     if method == "3":
         config = WallLineConfig.model_validate({"side": side, "beam": model == "beam", **lap})
         return WallLine(config), config.rate
@@ -121,7 +121,7 @@ def pilot(method: str, model: str, side: str, lap: dict[str, float]) -> tuple[Be
 
 
 def do(job: Job) -> Result:
-    """Drive."""
+    """Run one job."""
     arena = drawn(job.seed) if job.part == "arenas" else study()
     behaviour, rate = pilot(job.method, job.model, job.side, {"lap_length": 8.0} if job.part == "arenas" else LAP)
     fault = None
@@ -135,7 +135,7 @@ def do(job: Job) -> Result:
 
 
 def kept(job: Job, folder: Path | None) -> Result:
-    """``do``, or what it gave before."""
+    """Return the result of ``do``, or its earlier result."""
     if folder is None:
         return do(job)
     name = "-".join(re.sub(r"[^a-z0-9.]+", "_", str(value)) for value in job if not isinstance(value, tuple))
@@ -149,7 +149,7 @@ def kept(job: Job, folder: Path | None) -> Result:
 
 
 def steepest(run: WallRun) -> tuple[float, float]:
-    """Greatest acceleration and jerk of the planned ramps at 100 Hz."""
+    """Return the maximum acceleration and jerk of the planned ramps at 100 Hz."""
     acceleration = jerk = 0.0
     for ramp in run.ramps:
         a1, a2 = ramp.shape.coefficients
@@ -160,7 +160,7 @@ def steepest(run: WallRun) -> tuple[float, float]:
 
 
 def errors_along(arena: Arena, track: Array) -> Array:
-    """Errors of the side sonar's distance from the line of its wall; NaN in and near corners and in the approach."""
+    """Return the errors of the side sonar's distance from its wall; NaN in and near corners and in the approach."""
     errors, place, left = np.full(len(track), np.nan), FIVE_SONARS["l"], AFTER
     before = track[0, :2]
     for i, (x, y, yaw, _, found) in enumerate(track):
@@ -182,7 +182,7 @@ def errors_along(arena: Arena, track: Array) -> Array:
 
 
 def row_of(job: Job) -> str:
-    """Name of the row to which a run belongs."""
+    """Return the name of the row of a run."""
     return {
         "study": f"{job.method}, {job.model}",
         "start": f"start: {job.method}, {job.model}",
@@ -192,7 +192,7 @@ def row_of(job: Job) -> str:
 
 
 def summary(results: list[Result]) -> dict[str, Any]:
-    """Figures of the runs of one row."""
+    """Return the figures of the runs of one row."""
     done = [r for r in results if r.run.reason is Reason.BEHAVIOUR_DONE]
     errors = [r.errors[~np.isnan(r.errors)] * 1000 for r in done]
     counted = np.concatenate(errors) if errors else np.zeros(0)
@@ -222,7 +222,7 @@ def summary(results: list[Result]) -> dict[str, Any]:
 
 
 def _step_times(results: list[Result]) -> list[float]:
-    """Processor time of the behaviour's steps, ms: median, 99 of 100, greatest."""
+    """Return the processor time of the behaviour's steps, ms: median, 99th percentile, maximum."""
     costs = np.concatenate([r.run.costs for r in results]) * 1000
     return [round(float(value), 2) for value in np.percentile(costs, (50, 99, 100))]
 

@@ -1,11 +1,11 @@
-"""What the worker processes of a robot cost: processor time of their starts, and memory.
+"""Cost of a robot's worker processes: processor time of their starts, and memory.
 
     python -m benchmarks.workers [--runs 3]
 
-All kinds of workers are forked by one server, as the daemon's are, then started once more. Beside them each kind is
-started by a process with a server of its own, as if every worker were a fresh interpreter; its memory is counted after
-that server has ended. Processor time is that of servers and workers, memory their proportional share (PSS); medians of
-``--runs``. Kernels are compiled before. The last line is JSON.
+One server forks all kinds of workers, as in the daemon, and starts them once more. For comparison, each kind is also
+started by a separate process with its own server, like a fresh interpreter; its memory is measured after that server
+has ended. Processor time is that of servers and workers, memory their proportional share (PSS); medians of ``--runs``.
+Kernels are compiled before. The last line is JSON.
 """
 
 import argparse
@@ -25,7 +25,7 @@ TIMEOUT = 120.0
 
 
 def started(stack: ExitStack, target: str) -> WorkerProcess:
-    """A worker that is built."""
+    """Return a worker that has been built."""
     worker = WorkerProcess(target.partition(":")[0], target, TIMEOUT)
     stack.callback(worker.kill)
     worker.receive(TIMEOUT)
@@ -33,24 +33,24 @@ def started(stack: ExitStack, target: str) -> WorkerProcess:
 
 
 def children(of: int) -> list[int]:
-    """Processes that a process has started."""
+    """Return the child processes of a process."""
     return [int(child) for child in Path(f"/proc/{of}/task/{of}/children").read_text().split()]
 
 
 def seconds(process: int) -> float:
-    """Processor time of a process, s."""
+    """Return the processor time of a process, s."""
     fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def megabytes(process: int) -> float:
-    """Proportional share of a process in the memory (PSS), MB."""
+    """Return the proportional share of a process in memory (PSS), MB."""
     line = next(row for row in Path(f"/proc/{process}/smaps_rollup").read_text().splitlines() if row.startswith("Pss:"))
     return int(line.split()[1]) * 1024 / 1e6
 
 
 def forked(targets: tuple[str, ...]) -> dict[str, float]:
-    """All workers by one server, and the processor time of a second start of each."""
+    """Start all workers by one server; return also the processor time of a second start of each."""
     with ExitStack() as stack:
         for target in targets:
             started(stack, target)
@@ -66,7 +66,7 @@ def forked(targets: tuple[str, ...]) -> dict[str, float]:
 
 
 def alone(target: str) -> dict[str, float]:
-    """One worker by a server of its own, which ends before the memory is counted."""
+    """Start one worker by a separate server, which ends before the memory is measured."""
     with ExitStack() as stack:
         worker = started(stack, target)
         (server,) = children(os.getpid())
@@ -78,7 +78,7 @@ def alone(target: str) -> dict[str, float]:
 
 
 def measured(*arguments: str) -> dict[str, float]:
-    """Figures of one run in a process of its own."""
+    """Return the figures of one run in a separate process."""
     command = [sys.executable, "-m", "benchmarks.workers", *arguments]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)  # our own
     figures: dict[str, float] = json.loads(done.stdout)

@@ -1,15 +1,14 @@
-"""The simulated world: are its scans exact, how many a second, and how fast is the whole daemon on the virtual clock.
+"""The simulated world: exactness and rate of its scans, and speed of the whole daemon on the virtual clock.
 
     python benchmarks/world.py [--peer LASER_MODELS.PY] [--laps N]
 
-Scans of 682 beams from seeded free poses on a seeded map of 1000 x 1000 cells of 5 cm (50 x 50 m of walls with
-doors and posts), to 5.6 m (the URG-04LX's reach) and to 30 m. Every range is compared with an exact walk, cell by
-cell, written here for that purpose. ``--peer`` names f1tenth_gym's ``gym/f110_gym/envs/laser_models.py``: its numba
-simulator then scans from the same poses, without noise, in turn with ours; otherwise its figures measured elsewhere
-are quoted.
+Scans of 682 beams from seeded free poses on a seeded map of 1000 x 1000 cells of 5 cm (50 x 50 m of walls with doors
+and posts), to 5.6 m (the URG-04LX's range) and to 30 m. Every range is compared with an exact walk, cell by cell,
+written here for that purpose. ``--peer`` names f1tenth_gym's ``gym/f110_gym/envs/laser_models.py``: its numba simulator
+then scans from the same poses, without noise, in turn with ours; otherwise published figures are quoted.
 
-The daemon is the fast demo's: daemon, emulated devices, world and recorder in one process. Two runs of one seed
-must record the same. Its speed is simulated per real time; as the machine may be shared, that per processor time is
+The daemon is the fast demo's: daemon, emulated devices, world and recorder in one process. Two runs of one seed must
+record the same. Its speed is simulated per real time; because the machine may be shared, that per processor time is
 reported, too. The last line is JSON.
 """
 
@@ -45,7 +44,7 @@ NOTHING = np.zeros((0, 3)), np.zeros((0, 4))
 
 
 def make_map(seed: int = 1) -> NDArray[np.bool_]:
-    """Rooms of 5 m with doors of 1 m, and posts: (rows, columns), row 0 lowest y."""
+    """Return rooms of 5 m with doors of 1 m, and posts: (rows, columns), row 0 lowest y."""
     rng = np.random.default_rng(seed)
     occupied = np.zeros((CELLS, CELLS), bool)
     for at in range(0, CELLS + 1, 100):
@@ -61,7 +60,7 @@ def make_map(seed: int = 1) -> NDArray[np.bool_]:
 
 
 def free_poses(occupied: NDArray[np.bool_], count: int, seed: int = 2) -> Array:
-    """(count, 3) of x, y, yaw, at least 20 cm away from everything."""
+    """Return poses (count, 3) at least 20 cm away from all obstacles."""
     rng = np.random.default_rng(seed)
     rows, columns = np.nonzero(clearance(occupied) > 4)
     chosen = rng.integers(len(rows), size=count)
@@ -72,7 +71,7 @@ def free_poses(occupied: NDArray[np.bool_], count: int, seed: int = 2) -> Array:
 
 @njit(cache=False)
 def exact_walk(occupied: NDArray[np.bool_], x: float, y: float, angle: float, reach: float) -> float:
-    """Distance to the first occupied cell on the ray, cell by cell; inf beyond ``reach`` or outside the grid."""
+    """Return the distance to the first occupied cell on the ray; inf beyond ``reach`` or outside the grid."""
     rows, columns = occupied.shape
     dx, dy = cos(angle), sin(angle)
     column, row, along = floor(x / RESOLUTION), floor(y / RESOLUTION), 0.0
@@ -93,12 +92,12 @@ def exact_walk(occupied: NDArray[np.bool_], x: float, y: float, angle: float, re
 
 
 def wrong(got: Array, want: Array, reach: float) -> float:
-    """Share of beams that are off by more than a cell; nothing seen counts as ``reach``."""
+    """Return the share of beams that are off by more than a cell; no return counts as ``reach``."""
     return float(np.mean(np.abs(np.minimum(got, reach) - np.minimum(want, reach)) > RESOLUTION))
 
 
 def load_peer(path: Path) -> ModuleType:
-    """f1tenth_gym's module, by itself."""
+    """Import f1tenth_gym's module alone."""
     spec = importlib.util.spec_from_file_location("laser_models", path)
     assert spec is not None
     assert spec.loader is not None
@@ -109,7 +108,7 @@ def load_peer(path: Path) -> ModuleType:
 
 
 def peer_scanner(module: ModuleType, occupied: NDArray[np.bool_], reach: float) -> Callable[[Array], Array]:
-    """Its simulator on our map: set as its ``set_map`` sets it from a file."""
+    """Return its simulator on our map, set as its ``set_map`` does from a file."""
     simulator = module.ScanSimulator2D(BEAMS, FIELD, max_range=reach)
     simulator.map_height, simulator.map_width = occupied.shape
     simulator.map_resolution = RESOLUTION
@@ -120,7 +119,7 @@ def peer_scanner(module: ModuleType, occupied: NDArray[np.bool_], reach: float) 
 
 
 def our_scanner(occupied: NDArray[np.bool_], reach: float) -> Callable[[Array], Array]:
-    """The world's, from a truck that stands."""
+    """Return the world's scanner, for a standing truck."""
     clear, beams = clearance(occupied), np.linspace(-FIELD / 2, FIELD / 2, BEAMS)
 
     def scan(pose: Array) -> Array:
@@ -131,7 +130,7 @@ def our_scanner(occupied: NDArray[np.bool_], reach: float) -> Callable[[Array], 
 
 
 def rates(scanners: dict[str, Callable[[Array], Array]], poses: Array, rounds: int = 15) -> dict[str, Array]:
-    """Scans per second of processor time, in turn: (rounds,) each."""
+    """Return scans per second of processor time, measured in turn: (rounds,) each."""
     found = {name: np.empty(rounds) for name in scanners}
     for scan in scanners.values():
         scan(poses[0])
@@ -145,7 +144,7 @@ def rates(scanners: dict[str, Callable[[Array], Array]], poses: Array, rounds: i
 
 
 def lidar(peer: Path | None) -> dict[str, float]:
-    """Exactness and speed."""
+    """Return exactness and speed."""
     occupied = make_map()
     poses, beams = free_poses(occupied, 300), np.linspace(-FIELD / 2, FIELD / 2, BEAMS)
     module = load_peer(peer) if peer is not None else None
@@ -167,7 +166,7 @@ def lidar(peer: Path | None) -> dict[str, float]:
 
 
 def laps(config: Path, count: int) -> dict[str, Any]:
-    """The fast demo, ``count`` times with one seed."""
+    """Run the fast demo ``count`` times with one seed."""
     speeds, per_cpu, digests = [], [], set()
     for _ in range(count):
         with tempfile.TemporaryDirectory() as folder:

@@ -92,7 +92,7 @@ GOALS: dict[str, tuple[str, float]] = {
 
 
 class Hands:
-    """On motor and servos of a world, whose time stands at ``now``."""
+    """Control of motor and servos of a world whose time is ``now``."""
 
     def __init__(self, world: World) -> None:
         self.world, self.now = world, 0
@@ -108,29 +108,29 @@ class Hands:
         return self.pulses[channel]
 
     def steer(self, front: float, rear: float) -> None:
-        """Both axles, rad."""
+        """Set both axles, rad."""
         for channel, angle in zip((1, 0), SteeringPolynomials().servo_from_axles(front, rear), strict=True):
             servo = ServoModelConfig(channel=channel)
             self.pulses[channel] = servo.centre_us + servo.us_per_degree * degrees(angle)
 
     def drive(self, speed: float) -> None:
-        """Wheel speed, m/s."""
+        """Set the wheel speed, m/s."""
         self.world.motors[0].command(self.now, -speed * RPM, 20_000.0)
 
     def wait(self, seconds: float) -> Any:
-        """Truth afterwards."""
+        """Let the time pass; return the truth afterwards."""
         self.now += round(seconds * SECOND)
         return self.world.truth(self.now)
 
 
 def hands(**config: Any) -> Hands:
-    """On a truck without noise in the middle of an open yard."""
+    """Return the control of a truck without noise in the middle of an open yard."""
     start = Pose2D(x=0.0, y=0.0, yaw=0.0)
     return Hands(World(WorldConfig(engine="mujoco", map="yard", noise=False, start=start, **config), 1))
 
 
 def scans() -> dict[str, float]:
-    """Share of beams that differ by at most 1 mm from the plane's."""
+    """Return the share of beams that differ by at most 1 mm from the plane's."""
     equal = beams = 0
     rng = np.random.default_rng(1)
     for name, count in (("loop", 10), ("rooms", 20), ("corridor_maze", 10), ("hall", 10)):
@@ -155,7 +155,7 @@ def scans() -> dict[str, float]:
 
 
 def overturn(parts: Mechanics, track: float, radius: float) -> float:
-    """Side slope at which the outer wheels carry everything, rad, of a body that leans on its springs."""
+    """Return the side slope at which the outer wheels carry everything, rad, of a body that leans on its springs."""
     arm, height = track / 2, parts.mass_height - radius  # a round tread carries in its middle
     roll_spring = 2 * parts.axle_spring * (track / 3) ** 2
     sprung, unsprung = parts.sprung, parts.mass - parts.sprung
@@ -175,7 +175,7 @@ def overturn(parts: Mechanics, track: float, radius: float) -> float:
 
 
 def mechanics() -> dict[str, float]:
-    """Against closed forms."""
+    """Compare with closed forms."""
     parts = Mechanics()
     it = hands()
     base = it.plant.model.body("base").id
@@ -225,7 +225,7 @@ def mechanics() -> dict[str, float]:
 
 
 def least_sum(geometry: FourWheelSteering, angles: tuple[float, ...]) -> float:
-    """Curvature at which the sum of the wheels' side slips is least, 1/m: a vertex, where two wheels roll."""
+    """Return the curvature with the least sum of the wheels' side slips, 1/m: a vertex, where two wheels roll."""
     places = geometry.wheel_positions
     best = (np.inf, 0.0)
     for i in range(4):
@@ -242,7 +242,7 @@ def least_sum(geometry: FourWheelSteering, angles: tuple[float, ...]) -> float:
 
 
 def turning() -> dict[str, float]:
-    """Curvature in every steering mode over that of the least squares, and of the least sum of slips."""
+    """Return the curvature in every steering mode relative to least squares, and to the least sum of slips."""
     linkage = SimTruckConfig().chassis().linkage
     geometry = FourWheelSteering()
     figures: dict[str, float] = {}
@@ -272,7 +272,7 @@ def turning() -> dict[str, float]:
 
 
 def step() -> dict[str, float]:
-    """How far half the step moves the end of a drive of 60 s with bends to both sides."""
+    """Return how far half the step moves the end of a drive of 60 s with bends to both sides."""
     ends = []
     for share in (1, 2):
         seconds = 0.002 / share
@@ -290,7 +290,7 @@ def step() -> dict[str, float]:
 
 
 def best(run: Callable[[], object], count: int, rounds: int = 7) -> float:
-    """Seconds of processor time a call, of the best of some rounds: other programs share the computer."""
+    """Return the processor time of a call (s), the best of some rounds, because other programs share the computer."""
     found = []
     for _ in range(rounds):
         begin = time.thread_time()
@@ -301,7 +301,7 @@ def best(run: Callable[[], object], count: int, rounds: int = 7) -> float:
 
 
 def speed() -> dict[str, float]:
-    """Cost of one step of MuJoCo and of the plant, of one swept scan, of one picture."""
+    """Return the cost of one step of MuJoCo and of the plant, of one swept scan, of one image."""
     figures: dict[str, float] = {}
     for name in ("level", "hills"):
         features = [] if name == "level" else [{"kind": "hills", "height": 0.03}]
@@ -333,7 +333,7 @@ def speed() -> dict[str, float]:
 
 
 def lap(keep: Path | None) -> dict[str, float]:
-    """The lap of the whole daemon, twice."""
+    """Drive the lap of the whole daemon twice."""
     digests, speeds, errors = [], [], []
     with tempfile.TemporaryDirectory() as folder:
         for i in range(2):

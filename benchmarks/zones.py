@@ -71,7 +71,7 @@ def corners_of(pose: tuple[float, ...], length: float = LENGTH, width: float = W
 
 
 def overlap(zone: Polygon, body: Polygon) -> float:
-    """Area that a convex body shares with a polygon, m^2: the polygon clipped at every side of the body."""
+    """Return the area that a convex body shares with a polygon, m^2: the polygon clipped at every side of the body."""
     part = zone
     for (ax, ay), (bx, by) in zip(body, body[1:] + body[:1], strict=True):
         side = [(bx - ax) * (y - ay) - (by - ay) * (x - ax) for x, y in part]
@@ -94,7 +94,7 @@ def touches(zones: list[Polygon], body: Polygon, least: float = 1e-6) -> bool:
 
 
 def blob(rng: np.random.Generator, middle: np.ndarray, size: float) -> Polygon:
-    """A star-shaped polygon around a place."""
+    """Return a star-shaped polygon around a place."""
     count = int(rng.integers(3, 8))
     turns = (np.arange(count) + rng.uniform(-0.2, 0.2, count)) * math.tau / count
     return [
@@ -145,7 +145,7 @@ class World:
                 return pose
 
     def easy(self, pose: tuple[float, ...]) -> bool:
-        """Whether a circle around the robot gets there from the start, with room to turn."""
+        """Whether a circle around the robot reaches the pose from the start, with room to turn."""
         blocked = self.cells >= 50
         y, x = (np.mgrid[0 : len(blocked), 0 : len(blocked)] + 0.5) * CELL
         for zone in self.closed:
@@ -162,7 +162,7 @@ class World:
 
 
 async def drive(world: World, rig: VirtualRig, clock: VirtualClock) -> dict[str, int]:
-    """Drive to all goals; then have the pose jump into a zone."""
+    """Drive to all goals; then let the pose jump into a zone."""
     row = {"goals": 0, "reached": 0, "refused": 0, "wrong_refusals": 0, "missed": 0}
     operator, states = LocalOperator(rig.daemon, clock), rig.bus.subscribe(topics.GOAL, fifo(100_000))
     for number, goal in enumerate(world.goals, 1):
@@ -193,7 +193,7 @@ async def drive(world: World, rig: VirtualRig, clock: VirtualClock) -> dict[str,
 
 
 async def surprise(rig: VirtualRig, clock: VirtualClock) -> int:
-    """Drive by hand, and have a zone appear under the robot: whether it drove on."""
+    """Drive by hand, and add a zone under the robot; return whether it drove on."""
     operator = LocalOperator(rig.daemon, clock)
     gate = rig.bus.newest(topics.GATE)
     if gate is None or not gate.mode.active:
@@ -215,7 +215,7 @@ async def surprise(rig: VirtualRig, clock: VirtualClock) -> int:
 
 
 def trial(seed: int) -> dict[str, Any]:
-    """One world."""
+    """Run one world."""
     row: dict[str, Any] = {"seed": seed}
     with TemporaryDirectory() as name:
         world = World(seed, Path(name))
@@ -245,7 +245,7 @@ def trial(seed: int) -> dict[str, Any]:
 
 
 def judge(world: World, truth: np.ndarray, row: dict[str, Any]) -> None:
-    """Entries and excesses of speed by the world's truth; columns t, x, y, yaw, ..., collided."""
+    """Count entries and speed violations by the world's truth; columns t, x, y, yaw, ..., collided."""
     step = max(round(0.1 / float(np.median(np.diff(truth[:, 0])))), 1)
     shown = truth[::step]
     bodies = [corners_of(tuple(pose)) for pose in shown[:, 1:4].tolist()]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Options:
-    """What the command line says."""
+    """Command-line options."""
 
     data: Path | None
     """Folder with ``maps`` and ``planning``; None: only what needs no data."""
@@ -19,18 +19,18 @@ class Options:
 
 @dataclass
 class Part:
-    """What a part found: every goal is an upper bound of the figure of the same name."""
+    """Result of a part: every goal is an upper bound of the figure of the same name."""
 
     figures: dict[str, float] = field(default_factory=dict)
     goals: dict[str, float] = field(default_factory=dict)
 
     def add(self, name: str, figure: float, goal: float | None = None) -> None:
-        """Note a figure, and its goal if it has one."""
+        """Add a figure, with its goal if it has one."""
         self.figures[name] = round(figure, 6)
         if goal is not None:
             self.goals[name] = goal
 
     @property
     def met(self) -> bool:
-        """Whether every goal is kept."""
+        """Whether every goal is met."""
         return all(self.figures[name] <= goal for name, goal in self.goals.items())

@@ -1,8 +1,9 @@
-"""The author's own set-up as a yardstick: goals in the rooms, whole daemon, ``as-published.yaml`` and ``goals.yaml``.
+"""The author's own set-up as a baseline: goals in the rooms, whole daemon, ``as-published.yaml`` and ``goals.yaml``.
 
-A* over the grid, rsband (start_to_next) and the fuzzy tracker with their published faults drive the goals that the part
-``daemon`` draws; nothing stands on any route. A run ends after ``SECONDS`` of driving at the latest, as a published one
-may drive to and fro at its goal for ever. Errors are those of the true pose where the run ended, reached or not.
+A* over the grid, rsband (start_to_next) and the fuzzy tracker with their published faults drive to the goals drawn by
+the part ``daemon``, without obstacles on the routes. A run ends after ``SECONDS`` of driving at the latest, because the
+published tracker may drive to and fro at its goal for ever. Errors are those of the true pose at the end of the run,
+whether the goal was reached or not.
 """
 
 import numpy as np

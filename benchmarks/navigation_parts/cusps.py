@@ -1,8 +1,7 @@
-"""Turning round in corridors of 0.80 to 1.0 m, by the whole daemon on the virtual clock: cusps, contact, the goal met.
+"""Turns in corridors of 0.80 to 1.0 m, by the whole daemon on the virtual clock: cusps, contacts, final error.
 
-The map's cells are 2.5 cm, planner and manager have their defaults. Where there is less room than the gate keeps by
-default, it has to allow the truck nearer to the walls. Errors are those of the true pose, with odometry's in them, as
-there is no slam.
+The map's cells are 2.5 cm; planner and manager have their defaults. Where the corridor leaves less room than the gate
+keeps by default, its margin is reduced. Errors are those of the true pose, including odometry's, as there is no slam.
 """
 
 import json

@@ -1,9 +1,9 @@
-"""The whole daemon on the virtual clock: random goals in the rooms, each run twice, decisions compared.
+"""The whole daemon on the virtual clock: random goals in the rooms, each driven twice, with equal decisions.
 
-Devices are the emulated ones, byte for byte; planner, deformer and tracker run in the loop. Every other run puts a post
-onto the route while the truck drives, at the first place ahead where it shuts no door: a way with ``ROOM`` beside the
-truck remains. Errors are those of the true pose, with odometry's in them, as there is no slam. Further goals are driven
-once, with nothing on any route: a deformed route in a run without a post has no cause.
+Devices are emulated byte for byte; planner, deformer and tracker run in the loop. Every other run puts a post onto the
+route while the truck drives, at the first place ahead where ``ROOM`` remains free beside it. Errors are those of the
+true pose, including odometry's, as there is no slam. Further goals are driven once without a post: a deformed route is
+unjustified there.
 """
 
 import asyncio
@@ -96,7 +96,7 @@ def random_goal(truth: DistanceField, low: np.ndarray, size: np.ndarray, rng: np
 
 
 def drive(goal: Goal, seed: int, *, surprise: bool, base: str = "goals.yaml", seconds: float = 600.0) -> dict[str, Any]:
-    """One run with the configuration ``base``, given up after some seconds of driving."""
+    """Run once with the configuration ``base``, for at most this time of driving."""
     config = with_overlay(load_config(CONFIGS / base, SimulatedTruckConfig)[0], IN_THE_LOOP)
     if isinstance(config.planner.route, HybridConfig):
         config = with_overlay(config, {"planner": {"route": {"effort": 8000}}})
@@ -128,7 +128,7 @@ def drive(goal: Goal, seed: int, *, surprise: bool, base: str = "goals.yaml", se
 
 
 async def pursue(rig: VirtualRig, clock: VirtualClock, goal: Goal, *, surprise: bool) -> GoalState:
-    """Ask for the goal, arm, perhaps step into the way, and wait for the end."""
+    """Send the goal, arm, optionally put a post onto the route, and wait for the end."""
     operator, states = LocalOperator(rig.daemon, clock), rig.bus.subscribe(topics.GOAL, fifo(100_000))
     gate = rig.bus.newest(topics.GATE)
     assert gate is not None
@@ -160,7 +160,7 @@ async def last(states: Any) -> GoalState:
 
 
 async def step_in(rig: VirtualRig, clock: VirtualClock, goal: Goal) -> None:
-    """A post on the route before the truck, once it has driven for some seconds; never at the goal."""
+    """Put a post onto the route ahead of the truck after some seconds of driving; never at the goal."""
     await clock.sleep(6.0)
     path = rig.bus.newest(topics.PATH)
     truth = rig.world.truth(clock.now())
@@ -177,7 +177,7 @@ async def step_in(rig: VirtualRig, clock: VirtualClock, goal: Goal) -> None:
 
 
 def way_remains(world: Any, post: np.ndarray, here: Goal, goal: Goal) -> bool:
-    """Whether the map's own truth leaves a way past a post."""
+    """Whether the true map leaves a passage beside a post."""
     rows, columns = np.indices(world.cells.shape)
     x, y = ((v + 0.5) * world.resolution + low for v, low in zip((columns, rows), world.origin, strict=True))
     cells = np.where(np.hypot(x - post[0], y - post[1]) < POST + world.resolution / 2, 100, world.cells)

@@ -1,8 +1,8 @@
-"""Local planners: obstacles on a route that the map does not contain, with front steering and with both axles.
+"""Local planners: obstacles on a route that are not on the map, with front steering and with both axles.
 
 A kinematic truck with a lidar drives each scenario with each local planner; all share window, follower and goal
 tolerance (0.2 m, 0.2 rad, the author's). A run is better than that of the published planner (same strategy; the
-author's for teb) if it arrives where that fails, or both arrive and it is not slower, and it has no more contacts.
+author's for teb) if it arrives where that fails, or if both arrive, it is not slower, and it has no more contacts.
 """
 
 import json
@@ -74,7 +74,7 @@ def run(options: Options) -> Part:
 
 
 def drive(scenario: Scenario, car: Any, config: LocalPlannerConfig, limit: float = LIMIT) -> dict:
-    """One run in closed loop."""
+    """Run once in closed loop."""
     vehicle = Vehicle.truck(car)
     route, world, window = scenario.route(vehicle), World(scenario), Window()
     planner, state, truck = make_local_planner(vehicle, config), LocalPlannerState(), Truck(scenario.start)
@@ -119,7 +119,7 @@ def drive(scenario: Scenario, car: Any, config: LocalPlannerConfig, limit: float
 
 
 def beyond(path: MotionPath, vehicle: Vehicle) -> int:
-    """Pieces of a path that the truck's wheels cannot drive."""
+    """Return the number of pieces of a path that the truck's wheels cannot drive."""
     turn, slip = path.segments[:, 1], path.segments[:, 2]
     if vehicle.steering == "front":
         return int(((np.abs(turn) > math.tan(ANGLE) / TRUCK.wheelbase + 1e-6) | (slip != 0.0)).sum())
@@ -162,7 +162,7 @@ def sum_up(part: Part, rows: list[dict]) -> None:
 
 
 def draw(options: Options, rows: list[dict], scenarios: tuple[Scenario, ...]) -> None:
-    """Traces of all runs, ours in colour, published grey."""
+    """Draw all runs, ours in colour, the published planner's in grey."""
     figure = new_figure(13, 3.6 * len(scenarios))
     axes = figure.subplots(len(scenarios), 2, squeeze=False)
     for line, scenario in zip(axes, scenarios, strict=True):

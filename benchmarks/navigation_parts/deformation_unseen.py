@@ -1,6 +1,6 @@
-"""Local planners in scenarios they were not developed on: other measures, boxes, doors and people, drawn at random.
+"""Local planners in scenarios not used in development: other dimensions, boxes, doors and people, drawn at random.
 
-Same truck, lidar, follower and tolerance as in the part deformation, the published planner left out.
+Same truck, lidar, follower and tolerance as in the part deformation, without the published planner.
 """
 
 import json

@@ -30,7 +30,7 @@ Box = tuple[float, float, float, float]
 
 
 def grid(*boxes: Box):  # noqa: ANN201
-    """Occupied cells of a walled room with boxes x0, y0, x1, y1."""
+    """Return the occupied cells of a walled room with boxes x0, y0, x1, y1."""
     occupied = np.zeros((round(SIZE[1] / RES), round(SIZE[0] / RES)), bool)
     occupied[[0, 1, -1, -2]] = True
     occupied[:, [0, 1, -1, -2]] = True
@@ -41,7 +41,7 @@ def grid(*boxes: Box):  # noqa: ANN201
 
 @dataclass
 class Scenario:
-    """What the map knows and what is there."""
+    """Mapped and true obstacles."""
 
     name: str
     start: tuple[float, float, float]
@@ -68,12 +68,12 @@ class Scenario:
 
 
 def _leaf(t: float) -> tuple[Box, ...]:
-    """A door leaf that slides through the gap from 4 to 8 s."""
+    """Return a door leaf that slides through the gap from 4 to 8 s."""
     return ((3.4, 2.1, 3.48, 2.1 + 0.65 * min(max((t - 4.0) / 4.0, 0.0), 1.0)),)
 
 
 def _walker(t: float) -> tuple[float, float]:
-    """Crosses the route, stands on it for some seconds, and goes on."""
+    """Return the place of a person who crosses the route, stops on it for some seconds, and walks on."""
     return 3.0, 1.0 + 0.2 * min(t, 8.0) + 0.2 * max(t - 13.0, 0.0) if t < 21.0 else 4.2
 
 
@@ -102,7 +102,7 @@ SCENARIOS = (
 
 
 def unseen(seed: int) -> tuple[Scenario, ...]:
-    """The same kinds of trouble with other measures, drawn at random; the rules were not developed on them."""
+    """Return scenarios of the same kinds with other dimensions, drawn at random, not used for development."""
     rng = np.random.default_rng([3, seed])
 
     def draw(low: float, high: float) -> float:
@@ -147,7 +147,7 @@ def unseen(seed: int) -> tuple[Scenario, ...]:
 
 
 class World:
-    """A scenario as it is at some time."""
+    """A scenario at an instant."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
@@ -158,7 +158,7 @@ class World:
         self.at(0.0, None)
 
     def at(self, t: float, pose) -> None:  # noqa: ANN001
-        """Move on to a time; a person does not walk into the truck."""
+        """Advance to a time; a person does not walk into the truck."""
         boxes = (*self.scenario.known, *self.scenario.hidden(t))
         if boxes != self._boxes:
             self._boxes = boxes
@@ -179,13 +179,13 @@ class World:
         return float(clearance_to_points(BODY, np.array([pose]), person[:, :2])[0] - 0.2)
 
     def clearance(self, pose) -> float:  # noqa: ANN001
-        """Between the truck and the nearest thing, m; not above 0: contact."""
+        """Return the distance between the truck and the nearest obstacle, m; 0 or less: contact."""
         near = self.points[np.hypot(*(self.points - np.array(pose[:2])).T) < 1.0]
         gap = float(clearance_to_points(BODY, np.array([pose]), near)[0]) - 0.5 * RES
         return min(gap, self._gap(pose, self.person)) if len(self.person) else gap
 
     def scan(self, pose, window: Window) -> None:  # noqa: ANN001
-        """What the lidar sees from a pose, into the window."""
+        """Add the lidar's view from a pose to the window."""
         x, y, yaw = pose
         x, y = x + LIDAR * math.cos(yaw), y + LIDAR * math.sin(yaw)
         angles = yaw + BEAMS
@@ -201,7 +201,7 @@ class World:
 
 @dataclass
 class Truck:
-    """Kinematic truck with rates: 1 rad/s of steering, 0.5 m/s2."""
+    """Kinematic truck with limited rates: 1 rad/s of steering, 0.5 m/s2."""
 
     pose: tuple[float, float, float]
     speed: float = 0.0
@@ -209,7 +209,7 @@ class Truck:
     rear: float = 0.0
 
     def step(self, speed: float, front: float, rear: float) -> None:
-        """Obey for one step."""
+        """Execute a request for one step."""
         self.front += min(max(front - self.front, -STEP), STEP)
         self.rear += min(max(rear - self.rear, -STEP), STEP)
         self.speed += min(max(speed - self.speed, -0.5 * STEP), 0.5 * STEP)
@@ -218,7 +218,7 @@ class Truck:
 
 
 class Follower:
-    """Drives a path: its curvature and sideslip, and feedback of the distance and heading from it."""
+    """Follows a path: feed-forward of curvature and sideslip, and feedback of distance and heading."""
 
     def __init__(self, path: MotionPath, vehicle: Vehicle) -> None:
         self.front_only = vehicle.steering == "front"

@@ -1,7 +1,7 @@
-"""Rough ground on the direct way: by which detours routes go round it, with the planner of a truck as configured.
+"""Rough ground on the direct route: the detours accepted by the planner of a truck as configured.
 
-A hall has two ways to the goal: a direct one, rough over most of its length, and a detour, longer from map to map. A
-detour counts by its length over the direct way's; up to ``DETOUR`` it is to be taken.
+A hall has two routes to the goal: a direct one, rough over most of its length, and a detour, whose length differs from
+map to map. A detour is measured by its length relative to the direct route; up to ``DETOUR`` it must be chosen.
 """
 
 import time
@@ -56,7 +56,7 @@ def run(_options: Options) -> Part:
 
 
 def hall(depth: float, *, closed: bool = False, roughness: float = 0.0) -> RouteMap:
-    """The hall with a block of this depth; ``closed``: the direct way is."""
+    """Return the hall with a block of this depth; ``closed``: the direct route is blocked."""
     cells = np.zeros((2 * WAY + round(depth / CELL), round(8.0 / CELL)), np.int8)
     cells[[0, -1]] = 100
     cells[:, [0, -1]] = 100

@@ -1,9 +1,9 @@
 """Light harness: random goals over maps, without serial lines and without Zenoh.
 
-The planning step and the tracker are the daemon's own; the truck is a kinematic one with the axles' turning rate and
-the drive's acceleration. Collisions are judged on the map by the footprint without padding. Every run has a seed of its
-own. A route is planned with little effort first and with the default where that finds none, so that equal runs are
-equal; goals to which no way leads are left out of the share, and counted.
+The planning step and the tracker are the daemon's own; the truck is kinematic, with the axles' turning rate and the
+drive's acceleration. Collisions are judged on the map by the footprint without padding. Every run has its own seed. A
+route is planned with little effort first, and with the default if none is found, so that equal runs are equal.
+Unreachable goals are excluded from the share, and counted.
 """
 
 import json
@@ -49,7 +49,7 @@ EFFORTS = 5000, 60_000
 
 @dataclass(frozen=True)
 class Place:
-    """One map: what plans on it, and what judges."""
+    """One map, with planner and judge."""
 
     name: str
     steps: tuple[PlanningStep, PlanningStep]
@@ -78,7 +78,7 @@ CONFIG = LqrConfig(kind="lqr", goal_tolerance=0.01)
 
 
 def random_pose(where: Place, rng: np.random.Generator) -> Pose2:
-    """A pose with some centimetres of room."""
+    """Return a pose with some centimetres of room."""
     while True:
         x, y = rng.uniform(where.low, where.high)
         pose = np.array([[x, y, rng.uniform(-math.pi, math.pi)]])
@@ -87,7 +87,7 @@ def random_pose(where: Place, rng: np.random.Generator) -> Pose2:
 
 
 def drive(where: Place, answer: RouteAnswer, pose: Pose2) -> tuple[Pose2, bool, float]:
-    """Follow a route; returns the last pose, whether it collided, and the seconds it took."""
+    """Follow a route; return the last pose, whether it collided, and the duration (s)."""
     planned = answer.path
     assert planned is not None
     path = DrivePath(
@@ -120,7 +120,7 @@ def drive(where: Place, answer: RouteAnswer, pose: Pose2) -> tuple[Pose2, bool, 
 
 
 def trip(where: Place, rng: np.random.Generator) -> dict[str, Any]:
-    """One random goal from one random start."""
+    """Drive to one random goal from one random start."""
     pose, goal = random_pose(where, rng), random_pose(where, rng)
     row: dict[str, Any] = {"map": where.name, "start": pose, "goal": goal, "collided": False, "seconds": 0.0}
     for number in range(ROUTES):

@@ -1,8 +1,8 @@
-"""Trackers that do not know, or know wrongly, how late the axles answer: the reference model of the part tracking.
+"""Trackers with unknown or wrongly configured latency of the axles, on the reference model of the part tracking.
 
-Each tracker that reckons with the delay drives every course with axles that answer after 0 to 150 ms, once with nothing
-configured, with 0, 50 and 150 ms of dead time configured, and with what is right. It is compared with pure pursuit with
-the same axles, which is given no delay either.
+Each tracker that compensates the delay drives every course with axle delays of 0 to 150 ms: with no delay configured,
+with 0, 50 and 150 ms of dead time configured, and with the right one. It is compared with pure pursuit on the same
+axles, also without a configured delay.
 """
 
 from typing import Any

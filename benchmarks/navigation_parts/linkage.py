@@ -1,8 +1,8 @@
-"""The truck's linkage: what its wheels do at given axle angles, and the body model of odometry, gate and trackers.
+"""The truck's linkage: its wheels' motion at given axle angles, against the body model of odometry, gate and trackers.
 
 Axle angles are those by the mean of the wheels' tangents, curvatures those of the wheels' least-squares motion
-(``common_motion``). The model is compared with it over the whole range of both servos. What calibrations make of trucks
-with other linkages is measured by ``benchmarks/calibration.py``.
+(``common_motion``). The model is compared with it over the whole range of both servos. Calibrations of trucks with
+other linkages are measured by ``benchmarks/calibration.py``.
 """
 
 import math

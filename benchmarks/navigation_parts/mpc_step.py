@@ -1,10 +1,10 @@
 """Processor time of a step of ``mpc``, against the same programme by CasADi's SQP method with OSQP.
 
 Both are trackers on the reference model of the part tracking, with the same base class, model, costs, limits and
-horizon; each drives every course, in turns. ``programme`` is ours with all it takes from the path, and of the peer
-the call of the solver alone. The peer takes one Gauss-Newton iteration per step from its last plan, as
-ours does; its functions are built beforehand. All rounds take the same steps, and the least time of a step counts: what
-more it took was the computer's.
+horizon; each drives every course, in turns. ``programme`` is the time of ours including its preparation from the path,
+and of the peer the call of the solver alone. The peer takes one Gauss-Newton iteration per step from its last plan, as
+ours does; its functions are built beforehand. All rounds take the same steps, and the least time of a step counts:
+additional time is due to other load.
 """
 
 import math
@@ -74,7 +74,7 @@ def run(options: Options) -> Part:
 
 
 def watched(build: type[PathTracker[MpcConfig]], times: list[float], config: Any, geometry: Any) -> PathTracker[Any]:
-    """A tracker that notes in ``times`` what its programme takes, ms: of the peer the call of the solver alone."""
+    """Return a tracker that records the time of its programme in ``times``, ms; of the peer the solver call alone."""
     tracker: Any = build(config, geometry)
     name = "solver" if build is CasadiMpc else "steer"
     call = getattr(tracker, name)
@@ -147,7 +147,7 @@ class CasadiMpc(PathTracker[MpcConfig]):
         return ca.nlpsol("mpc", "sqpmethod", programme, options)
 
     def steer(self, state: TrackingState) -> Angles:
-        """Axle angles for the coming period."""
+        """Return the axle angles for the next period."""
         fine = state.reference.at(state.distances(self._middles))
         furthest = APPROACH * float(state.distances(self._middles[-1:])[0] - state.s)
         speeds = state.speeds(self._middles)

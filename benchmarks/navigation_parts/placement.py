@@ -1,6 +1,6 @@
 """Steps of planner, local planner, tracker and explorer in the loop, in a worker, and in ``plan-server`` over Zenoh.
 
-Measured is the time from an input to its output, and by how much the outputs differ from those of the loop.
+Measures the time from an input to its output, and the difference of the outputs from those of the loop.
 """
 
 import asyncio

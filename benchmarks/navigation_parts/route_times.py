@@ -94,7 +94,7 @@ CACHED: dict = {}
 
 
 def add_change(part: Part, planner, route_map, cells, resolution, rng) -> None:  # noqa: ANN001
-    """Time to take over a map of which a few cells have changed, and to plan on it."""
+    """Time the acceptance of a map with a few changed cells, and planning on it."""
     times = []
     for _ in range(5):
         cells = cells.copy()
@@ -111,7 +111,7 @@ def add_change(part: Part, planner, route_map, cells, resolution, rng) -> None: 
 
 
 def cli_start(options: Options, occupied, resolution, pose) -> float:  # noqa: ANN001
-    """Processor time of ``monstertruckd plan`` for a motion of no length: all but the plan; compiled before."""
+    """Return the processor time of ``monstertruckd plan`` for a motion of zero length, without compilation."""
     import resource  # noqa: PLC0415
 
     # Bytecode is read and written where Python does so by default.

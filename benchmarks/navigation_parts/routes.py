@@ -1,7 +1,7 @@
 """Route planning compared with ompl's BIT*: the queries of a folder, with front steering and with both axles.
 
-Lengths count against the shortest known one of each query, times to the first route against BIT*'s median over some
-seeds in the same run, and a strict judge looks at every route.
+Lengths are relative to the shortest known one of each query, times to the first route relative to BIT*'s median over
+some seeds in the same run; a strict judge checks every route.
 """
 
 import json
@@ -102,7 +102,7 @@ def run(options: Options) -> Part:
 
 
 def read(path: Path):  # noqa: ANN201
-    """Occupied cells, the picture's border among them, and the resolution."""
+    """Return the occupied cells, including the border of the image, and the resolution."""
     world = load_map(path)
     occupied = world.cells != 0
     occupied[[0, -1]] = True
@@ -129,7 +129,7 @@ def judged(result, world, planner, query: Query, tolerance) -> dict:  # noqa: AN
 
 
 def refuse(part: Part, name: str, planner, route_map, query: Query, world) -> None:  # noqa: ANN001
-    """Bad goals: which reason, and after which time."""
+    """Test invalid goals: their reasons and times."""
     wall = np.array(middle_of_a_square(world))
     worst = 0.0
     for goal, reasons in (
@@ -146,7 +146,7 @@ def refuse(part: Part, name: str, planner, route_map, query: Query, world) -> No
 
 
 def walled_in(occupied, resolution, goal):  # noqa: ANN001, ANN201
-    """The map with a ring of wall round a goal."""
+    """Return the map with a ring of walls around a goal."""
     rows, columns = np.indices(occupied.shape)
     away = np.hypot((columns + 0.5) * resolution - goal[0], (rows + 0.5) * resolution - goal[1])
     return occupied | (np.abs(away - WALL) < resolution)
@@ -174,7 +174,7 @@ def sum_up(part: Part, rows: list[dict]) -> None:
 
 
 def peer(occupied, resolution: float, footprint: DiscFootprint, radius: float, query: Query, runs: int) -> dict:  # noqa: ANN001
-    """BIT*: time to its first route, and length and cusps after a second (medians over some runs)."""
+    """Run BIT*: time to its first route, and length and cusps after a second (medians over some runs)."""
     space = ob.ReedsSheppStateSpace(radius)
     bounds = ob.RealVectorBounds(2)
     for axis, cells in enumerate(occupied.shape[::-1]):
@@ -220,7 +220,7 @@ def bit_star(space, valid, resolution: float, query: Query, *, any_will_do: bool
 
 
 def validity(occupied, resolution: float, footprint: DiscFootprint):  # noqa: ANN001, ANN201
-    """The rule of the queries as fast as a Python callback can be."""
+    """Return the validity check of the queries, as fast as a Python callback allows."""
     distance = distance_transform_edt(~occupied) * resolution
     discs = np.array(footprint.centres)
 
@@ -244,7 +244,7 @@ def discs_free(distance, resolution, discs, radius, x, y, yaw):  # noqa: ANN001,
 
 
 def turns(space, path) -> int:  # noqa: ANN001
-    """Changes of direction along a path of Reeds-Shepp motions, seen at many points."""
+    """Return the number of changes of direction along a path of Reeds-Shepp motions, sampled densely."""
     states, between = path.getStates(), [space.allocState(), space.allocState()]
     signs = []
     for a, b in pairwise(states):
@@ -261,7 +261,7 @@ def turns(space, path) -> int:  # noqa: ANN001
 
 
 def draw(options: Options, rows: list[dict]) -> None:
-    """The routes on their maps."""
+    """Draw the routes on their maps."""
     for name in dict.fromkeys(row["map"] for row in rows):
         occupied, resolution = read(options.data / "maps" / f"{name}.yaml")
         extent = (0, occupied.shape[1] * resolution, 0, occupied.shape[0] * resolution)

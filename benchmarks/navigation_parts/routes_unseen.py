@@ -1,7 +1,7 @@
-"""Routes on maps drawn by seed: both axles against front steering, turning round in corridors, exhausted lattices.
+"""Routes on maps drawn by seed: both axles against front steering, turns in corridors, exhausted lattices.
 
-The truck with both axles counts against the one with front steering, and against one with front steering that turns on
-the circle of both axles, so that only translations tell them apart.
+The truck with both axles is compared with the one with front steering, and with one with front steering that turns on
+the circle of both axles, so that only translations distinguish them.
 """
 
 import math
@@ -69,7 +69,7 @@ def run(options: Options) -> Part:
 
 
 def turn_round(part: Part) -> None:
-    """Cusps of the daemon's own planner in corridors 0.80 m wide."""
+    """Count the cusps of the daemon's own planner in corridors 0.80 m wide."""
     config = PlannerConfig()
     assert isinstance(config.route, HybridConfig)
     planner = HybridPlanner(Vehicle.truck(config.steering, angle=config.angle), config.route)

@@ -1,7 +1,7 @@
-"""A strict judge of routes, of shapely polygons, that shares no code with any planner.
+"""A strict judge of routes, based on shapely polygons, that shares no code with any planner.
 
 It integrates a path's segments itself, takes a pose every centimetre and both ends of every segment, and looks for
-overlaps of the footprint's polygons with the squares of occupied cells, unknown ones and all off the map included.
+overlaps of the footprint's polygons with the squares of occupied and unknown cells and with everything off the map.
 """
 
 import math
@@ -17,7 +17,7 @@ SLIVER = 1e-9
 
 @dataclass(frozen=True)
 class Rule:
-    """What a path has to keep to."""
+    """Constraints on a path."""
 
     discs: tuple[float, ...]
     disc_radius: float
@@ -46,7 +46,7 @@ class World:
 
 
 def poses_of(start, segments):  # noqa: ANN001, ANN201
-    """Poses at most EVERY apart along (length, direction, curvature, sideslip) segments."""
+    """Return poses at most EVERY apart along (length, direction, curvature, sideslip) segments."""
     poses = [tuple(start)]
     x, y, yaw = start
     for length, direction, curvature, sideslip in segments:
@@ -65,7 +65,7 @@ def poses_of(start, segments):  # noqa: ANN001, ANN201
 
 
 def faults(world: World, rule: Rule, start, goal, segments) -> list[str]:  # noqa: ANN001
-    """Everything that is wrong with a path, in words; an empty list is a valid one."""
+    """Describe all faults of a path; a valid path has none."""
     found = []
     poses = poses_of(start, segments)
     for length, direction, curvature, sideslip in segments:

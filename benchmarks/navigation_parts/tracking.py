@@ -1,12 +1,12 @@
-"""Trackers on courses with the reference model: error, worst error, swept width; forward, backward, with cusps.
+"""Trackers on courses with the reference model: RMS and worst error, swept width; forward, backward, with cusps.
 
-The plant is a kinematic bicycle about the rear axle, wheelbase 0.30 m, steering +-0.6 rad, 10 ms steps, asked at 10 Hz,
-started 5 cm to the left. "ideal" steers at once; "lag" has 50 ms dead time, 0.10 s lag and 5 rad/s. The error is the
-rear axle's distance from the course, the first 5 % of the way left out. Forward and backward the speed is held; with
-cusps it follows what the tracker asks for with at most 1 m/s^2.
+The plant is a kinematic bicycle about the rear axle, wheelbase 0.30 m, steering +-0.6 rad, 10 ms steps, requests at 10
+Hz, started 5 cm to the left. "ideal" steers immediately; "lag" has 50 ms dead time, 0.10 s lag and 5 rad/s. The error
+is the rear axle's distance from the course, without its first 5 %. Forward and backward the speed is constant; with
+cusps it follows the tracker's request with at most 1 m/s^2.
 
-A run has arrived if the tracker ended it and the rear axle came within ``ARRIVED`` of the course's end: where it stands
-with cusps, where it passes by at held speed (which the tracker cannot bring to rest, so it says ``goal_missed``).
+A run has arrived if the tracker ended it and the rear axle came within ``ARRIVED`` of the course's end: at standstill
+with cusps, in passing at constant speed (which the tracker cannot stop, so it reports ``goal_missed``).
 """
 
 import math
@@ -54,7 +54,7 @@ TAIL = 50
 
 @dataclass
 class Plant:
-    """The truck that is steered."""
+    """The steered truck."""
 
     geometry: FourWheelSteering
     dead_time: float
@@ -70,7 +70,7 @@ class Plant:
         self.queue = deque([(0.0, 0.0)] * round(self.dead_time / STEP))
 
     def step(self, front: float, rear: float) -> None:
-        """One step with these requests."""
+        """Execute one step with these requests."""
         self.turn(front, rear)
         self.pose = self.geometry.integrate(
             self.pose, *self.geometry.body_twist(self.speed, self.front, self.rear), STEP
@@ -112,17 +112,17 @@ class Result:
 
     @property
     def work_ms(self) -> float:
-        """Median of a step."""
+        """Median duration of a step."""
         return float(np.median(self.steps_ms))
 
     @property
     def longest_ms(self) -> float:
-        """99th percentile of a step."""
+        """99th percentile of the duration of a step."""
         return float(np.quantile(self.steps_ms, 0.99))
 
     @property
     def arrived(self) -> bool:
-        """Whether the end was met."""
+        """Whether the end was reached."""
         return self.end <= 1000 * ARRIVED
 
 
@@ -170,7 +170,7 @@ def from_data(options: Options) -> dict[str, np.ndarray]:
 
 
 def built_in() -> dict[str, np.ndarray]:
-    """Courses for runs without data: arcs of 0.7 and 1.2 m with straights between, and a lemniscate."""
+    """Return courses for runs without data: arcs of 0.7 and 1.2 m with straights between, and a lemniscate."""
     pieces = ((1.0, 0.0), (1.1, 1 / 0.7), (0.8, 0.0), (1.9, -1 / 1.2), (0.4, 0.0), (2.0, -1 / 0.7), (1.0, 0.0))
     step = 0.025
     bends = np.concatenate([np.full(round(length / step), curvature) for length, curvature in pieces])
@@ -185,7 +185,7 @@ def built_in() -> dict[str, np.ndarray]:
 
 
 def route(points: np.ndarray, version: str, steering: str = "") -> Path:
-    """The course as a path."""
+    """Return the course as a path."""
     if version == "cusps":
         at = [round(share * (len(points) - 1)) for share in TURNS]
         index, directions = [at[0]], [1.0]
@@ -211,7 +211,7 @@ def drive(
     build: Callable[[AnyTracker, FourWheelSteering], PathTracker[Any]] = build_tracker,
     **more: object,
 ) -> Result:
-    """One run from 5 cm to the left of the beginning, by the tracker that ``build`` makes."""
+    """Run the tracker made by ``build`` once, from 5 cm to the left of the start."""
     dead_time, lag, rate = RESPONSES[axles]
     config = ADAPTER.validate_python(
         {
@@ -276,7 +276,7 @@ def drive(
 
 
 def heading(poses: np.ndarray, points: np.ndarray, *, backward: bool) -> float:
-    """RMS angle of the truck to the nearest piece of the course, rad."""
+    """Return the RMS angle of the truck to the nearest piece of the course, rad."""
     middle, step = 0.5 * (points[1:] + points[:-1]), np.diff(points, axis=0)
     nearest = cKDTree(middle).query(poses[:, :2])[1]
     along = np.arctan2(step[nearest, 1], step[nearest, 0]) + (math.pi if backward else 0.0)
@@ -284,7 +284,7 @@ def heading(poses: np.ndarray, points: np.ndarray, *, backward: bool) -> float:
 
 
 def swept(poses: np.ndarray, points: np.ndarray) -> float:
-    """Twice the greatest distance of the footprint's corners from the course, m."""
+    """Return twice the maximum distance of the footprint's corners from the course, m."""
     c, s = np.cos(poses[::5, 2]), np.sin(poses[::5, 2])
     corners = [
         poses[::5, :2] + np.column_stack((c * x - s * y, s * x + c * y)) for x in (-0.235, 0.235) for y in (-0.17, 0.17)
@@ -330,7 +330,7 @@ def report(part: Part, table: dict) -> None:
 
 
 def four_wheels(part: Part, arcs: np.ndarray) -> None:
-    """The truck at 0.2 m/s on the arcs, widened so that it can turn them with two wheels."""
+    """Drive the truck at 0.2 m/s on the arcs, widened so that it can turn them with two wheels."""
     wide = 1.4 * arcs
     print("the truck, four wheels against two: RMS / worst mm, swept width m")
     for name in ("lqr", "mpc"):

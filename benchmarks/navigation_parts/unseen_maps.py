@@ -1,4 +1,4 @@
-"""Maps drawn by seed, that no setting was tuned to: rooms with doors, mazes, halls with boxes; and poses on them."""
+"""Maps drawn by seed, not used for tuning: rooms with doors, mazes, halls with boxes; and poses on them."""
 
 from dataclasses import dataclass
 
@@ -13,14 +13,14 @@ NEAR = 0.02
 
 @dataclass(frozen=True)
 class UnseenMap:
-    """A map and where it comes from."""
+    """A map and its origin."""
 
     name: str
     occupied: np.ndarray
     """Shape (rows, columns), bool."""
 
     def route_map(self) -> RouteMap:
-        """What planners take."""
+        """Input of planners."""
         return RouteMap.from_cells(np.where(self.occupied, 100, 0).astype(np.int8), RESOLUTION)
 
 
@@ -101,7 +101,7 @@ def _scatter(occupied: np.ndarray, rng: np.random.Generator, count: int) -> None
 
 
 def free_pose(route_map: RouteMap, vehicle: Vehicle, rng: np.random.Generator) -> np.ndarray:
-    """A pose that is free, drawn until it is."""
+    """Draw poses until one is free."""
     rows, columns = (n - 2 for n in route_map.field.data().occupied.shape)
     size = np.array((columns, rows)) * route_map.field.resolution
     while True:

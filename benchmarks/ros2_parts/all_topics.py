@@ -1,4 +1,4 @@
-"""Every topic of a robot without devices, and how its messages are compared with those that ROS 2 nodes read."""
+"""Every topic of a robot without devices, and the comparison of its messages with those read by ROS 2 nodes."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -49,10 +49,10 @@ CELLS = 200
 
 
 class Maker:
-    """Messages with values that no other has.
+    """Creates messages with unique values.
 
     Args:
-        seed: of the values.
+        seed: seed of the values.
     """
 
     def __init__(self, seed: int) -> None:
@@ -75,7 +75,7 @@ class Maker:
         return {"resolution": 0.05, "width": size, "height": size, "origin": Pose2D(x=-5.0, y=-4.0, yaw=0.0)}
 
     def fields(self, topic: Topic[Any], now: int) -> Values:  # noqa: C901 - one case a topic
-        """Fields of a topic's next message besides its header."""
+        """Return the fields of a topic's next message without its header."""
         match topic:
             case t.SCAN:
                 codes = self._random.choice(np.array((VALID_BEAM, NO_ECHO, 40), np.uint8), 683, p=(0.8, 0.1, 0.1))
@@ -155,7 +155,7 @@ class Maker:
         yield Transform(parent="map", child="odom", stamp=now, translation=(x, y, 0.0), rotation=turn)
 
     def message(self, topic: Topic[Any], now: int, seq: int) -> Message:
-        """A topic's next message."""
+        """Return a topic's next message."""
         found: Message = topic.model(**{"stamp": now, "received": now, "seq": seq} | self.fields(topic, now))
         return found
 
@@ -164,22 +164,22 @@ class Maker:
 
 
 def yaw_of(turn: Values) -> float:
-    """Heading of a planar orientation, rad."""
+    """Return the heading of a planar orientation, rad."""
     return math.remainder(2.0 * math.atan2(turn["z"], turn["w"]), math.tau)
 
 
 def place_of(pose: Values) -> Rows:
-    """x, y, heading."""
+    """Return x, y, heading."""
     return [pose["position"]["x"], pose["position"]["y"], yaw_of(pose["orientation"])]
 
 
 def own_place(pose: Pose2D) -> Rows:
-    """The same of the robot's pose."""
+    """Return x, y, heading of the robot's own pose type."""
     return [pose.x, pose.y, math.remainder(pose.yaw, math.tau)]
 
 
 def xyz(vector: Any) -> Rows:
-    """Components of a vector of either side."""
+    """Return the components of a vector of either side."""
     return list(vector.values()) if isinstance(vector, Mapping) else [vector.x, vector.y, vector.z]
 
 
@@ -253,7 +253,7 @@ def lens_source(_: CompressedImage) -> Rows:
 
 
 def marked(kind: int) -> Callable[[Values], Rows]:
-    """Places and texts of the markers of one kind."""
+    """Return the places and texts of the markers of one kind."""
 
     def rows(m: Values) -> Rows:
         found = [one for one in m["markers"] if one["type"] == kind and one["action"] == 0]
@@ -268,7 +268,7 @@ def corners(m: Values) -> Rows:
 
 
 def sonar(name: str) -> Callable[[SonarRanges], Rows]:
-    """Range and limits of one sonar."""
+    """Return range and limits of one sonar."""
 
     def row(m: SonarRanges) -> Rows:
         (echo,) = (one for one in m.sonars if one.name == name)
@@ -390,7 +390,7 @@ BEST_EFFORT = {name for name, row in COMPARED.items() if not row.reliable}
 
 
 def nanoseconds(stamp: Values) -> int:
-    """Time of a stamp."""
+    """Return the time of a stamp."""
     return int(stamp["sec"]) * SECOND + int(stamp["nanosec"])
 
 
@@ -425,11 +425,11 @@ def same(found: Rows, expected: Rows) -> bool:
 
 
 def compared(ros: Mapping[str, list[Values]], sources: Mapping[Topic[Any], list[Any]], offset: int) -> dict[str, Any]:
-    """Messages with a source of the same stamp, those that differ, and the least share of the sources that came.
+    """Return the number of messages with a source of the same stamp, of differing ones, and the least received share.
 
     Args:
-        ros: what a node read, by topic.
-        sources: what the robot published.
+        ros: messages read by a node, by topic.
+        sources: messages published by the robot.
         offset: real time minus the robot's, ns.
     """
     rows: dict[str, list[tuple[Values, int]]] = {name: [] for name in COMPARED}

@@ -1,12 +1,12 @@
-"""Builds the interfaces that the wheels of ROS 2 lack by ``rosidl``, for real ``rclpy``.
+"""Builds the interfaces missing in the wheels of ROS 2 with ``rosidl``, for real ``rclpy``.
 
     PYTHON -m benchmarks.ros2_parts.build_messages
 
-``PYTHON`` is a virtual environment of Python 3.12; ROS 2 need not be installed. It has the wheels
+``PYTHON`` is a virtual environment of Python 3.12; ROS 2 need not be installed. It needs the wheels
 ``ros-jazzy-rclpy[fastrtps]``, ``ros-jazzy-sensor-msgs``, ``-nav-msgs``, ``-std-srvs``, ``-diagnostic-msgs``,
 ``-visualization-msgs``, ``-python-cmake-module``, all of ``ros-jazzy-ament-cmake*`` and ``ros-jazzy-rosidl*``,
 ``ros-ament-package``, ``catkin_pkg``, ``empy==3.3.4``, and this program's own dependencies (extra ``ros2``). CMake and
-a C++ compiler are needed, too. The packages of ``monstertruckd/ros2/interfaces.txt`` that it cannot import
+a C++ compiler are needed, too. The packages of ``monstertruckd/ros2/interfaces.txt`` that cannot be imported
 (``tf2_msgs``, ``nav2_msgs`` ...) are installed into its prefix. Prints their names.
 """
 
@@ -37,7 +37,7 @@ PACKAGE = """<package format="3"><name>{name}</name><version>1.0.0</version><des
 
 
 def packages() -> dict[str, dict[str, str]]:
-    """Texts of files by package: the editions of Jazzy, which have no mark."""
+    """Return the texts of files by package, in the edition of Jazzy, which has no suffix."""
     found: dict[str, dict[str, str]] = {}
     for part in INTERFACES.read_text(encoding="utf-8").split("=== ")[1:]:
         name, _, text = part.partition("\n")
@@ -48,7 +48,7 @@ def packages() -> dict[str, dict[str, str]]:
 
 
 def mend_paths() -> None:
-    """Replace the folders of Python on the computer that made the wheels."""
+    """Replace the Python paths of the computer that built the wheels."""
     numpy = importlib.util.find_spec("numpy")
     assert numpy is not None
     assert numpy.origin is not None

@@ -1,4 +1,4 @@
-"""Drives by ``pyzeros``: twists at 20 Hz, each with a speed of its own, which identifies it.
+"""Drives with ``pyzeros``: twists at 20 Hz, each with a unique speed that identifies it.
 
     python benchmarks/ros2_parts/pyzeros_driver.py PORT COUNT
 
@@ -19,7 +19,7 @@ STEP = 1e-6
 
 
 def session(port: int, timeout: int = 10_000) -> zenoh.Session:
-    """A session that dials the face; ``timeout`` is that of service calls, ms."""
+    """Return a session connected to the face; ``timeout`` is that of service calls, ms."""
     config = {
         "mode": "client",
         "connect": {"endpoints": [f"tcp/127.0.0.1:{port}"]},

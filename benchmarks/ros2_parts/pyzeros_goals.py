@@ -1,10 +1,10 @@
-"""Sends goals of ``navigate_to_pose`` by ``pyzeros``, with services and hashes of ``ros2_pyterfaces``.
+"""Sends goals of ``navigate_to_pose`` with ``pyzeros``, with services and hashes of ``ros2_pyterfaces``.
 
     python -m benchmarks.ros2_parts.pyzeros_goals PORT
 
-Waits for a line of JSON: two poses (x in m, y in m, yaw in rad) in map. The first is driven to, the drive
-to the second is cancelled, and a third far outside the map is refused. Prints a JSON object: status, text and number
-of feedbacks of each.
+Waits for a line of JSON: two poses (x in m, y in m, yaw in rad) in map. The goal at the first one is reached, the one
+at the second is cancelled, and a third far outside the map is refused. Prints a JSON object: status, text and number of
+feedback messages of each.
 """
 
 # mypy: disable-error-code="call-arg"
@@ -41,7 +41,7 @@ class Goal(idl.IdlStruct, typename=f"{TYPE}_Goal"):
 
 @dataclass
 class Result(idl.IdlStruct, typename=f"{TYPE}_Result"):
-    """Why it failed."""
+    """Reason of the failure."""
 
     error_code: idl.types.uint16 = 0
     error_msg: str = ""
@@ -60,7 +60,7 @@ class Feedback(idl.IdlStruct, typename=f"{TYPE}_Feedback"):
 
 @dataclass
 class FeedbackMessage(idl.IdlStruct, typename=f"{TYPE}_FeedbackMessage"):
-    """Progress of a goal."""
+    """Progress of a goal, with its id."""
 
     goal_id: UUID = field(default_factory=UUID)
     feedback: Feedback = field(default_factory=Feedback)
@@ -68,7 +68,7 @@ class FeedbackMessage(idl.IdlStruct, typename=f"{TYPE}_FeedbackMessage"):
 
 @dataclass
 class SendGoalRequest(idl.IdlStruct, typename=f"{TYPE}_SendGoal_Request"):
-    """Asks for a goal."""
+    """Request of a goal."""
 
     goal_id: UUID = field(default_factory=UUID)
     goal: Goal = field(default_factory=Goal)
@@ -76,7 +76,7 @@ class SendGoalRequest(idl.IdlStruct, typename=f"{TYPE}_SendGoal_Request"):
 
 @dataclass
 class SendGoalResponse(idl.IdlStruct, typename=f"{TYPE}_SendGoal_Response"):
-    """Whether it is accepted."""
+    """Whether the goal is accepted."""
 
     accepted: bool = False
     stamp: Time = field(default_factory=Time)
@@ -84,14 +84,14 @@ class SendGoalResponse(idl.IdlStruct, typename=f"{TYPE}_SendGoal_Response"):
 
 @dataclass
 class GetResultRequest(idl.IdlStruct, typename=f"{TYPE}_GetResult_Request"):
-    """Asks for the end of a goal."""
+    """Request of a goal's result."""
 
     goal_id: UUID = field(default_factory=UUID)
 
 
 @dataclass
 class GetResultResponse(idl.IdlStruct, typename=f"{TYPE}_GetResult_Response"):
-    """The end of a goal."""
+    """Result of a goal."""
 
     status: idl.types.int8 = 0
     result: Result = field(default_factory=Result)
@@ -99,7 +99,7 @@ class GetResultResponse(idl.IdlStruct, typename=f"{TYPE}_GetResult_Response"):
 
 @dataclass
 class GoalInfo(idl.IdlStruct, typename="action_msgs/msg/GoalInfo"):
-    """A goal."""
+    """Identity of a goal."""
 
     goal_id: UUID = field(default_factory=UUID)
     stamp: Time = field(default_factory=Time)
@@ -107,21 +107,21 @@ class GoalInfo(idl.IdlStruct, typename="action_msgs/msg/GoalInfo"):
 
 @dataclass
 class CancelRequest(idl.IdlStruct, typename="action_msgs/srv/CancelGoal_Request"):
-    """Asks for the end of a goal now."""
+    """Request to cancel a goal."""
 
     goal_info: GoalInfo = field(default_factory=GoalInfo)
 
 
 @dataclass
 class CancelResponse(idl.IdlStruct, typename="action_msgs/srv/CancelGoal_Response"):
-    """Goals that end."""
+    """Cancelled goals."""
 
     return_code: idl.types.int8 = 0
     goals_canceling: idl.types.sequence[GoalInfo] = field(default_factory=list)
 
 
 def service(request: Any, response: Any) -> Any:
-    """A service of two messages, with the event that is part of its hash."""
+    """Return a service of two messages, with the event that is part of its hash."""
     name = request.get_type_name().removesuffix("_Request")
 
     @dataclass

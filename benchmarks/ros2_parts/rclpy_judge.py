@@ -1,10 +1,11 @@
-"""Judges a face by nodes of real ``rclpy``; needs a Python with ROS 2's wheels, or a sourced ROS 2.
+"""Judges a face with nodes of real ``rclpy``; needs a Python with ROS 2's wheels, or a sourced ROS 2.
 
     python -m benchmarks.ros2_parts.rclpy_judge read SECONDS OUTPUT | late | drive | twists COUNT | hostile SECONDS
 
-``read`` pickles what every topic brought, by topic. The others print JSON on their last line: ``late`` the time until a
-new node has map, fixed transforms and description; ``drive`` what an armed robot did by twists, by a goal pose and by
-the actions of Nav2; ``twists`` and ``hostile`` print ``ready``, wait for a line, and print times of sending.
+``read`` pickles the messages of all topics, by topic. The others print JSON on their last line: ``late`` the time until
+a new node has map, static transforms and description; ``drive`` the results of driving an armed robot by twists, by a
+goal pose and by Nav2's actions; ``twists`` and ``hostile`` print ``ready``, wait for a line, and print times of
+sending.
 """
 
 import importlib
@@ -39,13 +40,13 @@ FIRST, STEP = 0.05, 1e-6
 
 
 def interface(name: str) -> Any:
-    """Class of an interface."""
+    """Return the class of an interface."""
     package, group, own = name.split("/")
     return getattr(importlib.import_module(f"{package}.{group}"), own)
 
 
 def plain(value: Any) -> Any:
-    """A message as dictionaries and lists."""
+    """Return a message as dictionaries and lists."""
     if hasattr(value, "get_fields_and_field_types"):
         return {name: plain(getattr(value, name)) for name in value.get_fields_and_field_types()}
     if hasattr(value, "tolist"):
@@ -60,7 +61,7 @@ def position(message: Any) -> tuple[float, float]:
 
 
 class Judge:
-    """One node, in a participant of its own: each has one interface for a topic."""
+    """One node in a separate participant, with one interface for each topic."""
 
     def __init__(self, name: str = "judge") -> None:
         context = Context()
@@ -70,29 +71,29 @@ class Judge:
         self._executor.add_node(self.node)
 
     def follow(self, topic: str, kind: Any, qos: Any = 10) -> list[Any]:
-        """Messages of a topic, as they come."""
+        """Return a growing list of a topic's messages."""
         found: list[Any] = []
         self.node.create_subscription(kind, topic, found.append, qos)
         return found
 
     def spin(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
-        """Take messages for a while."""
+        """Receive messages for a while."""
         end = time.monotonic() + seconds
         while time.monotonic() < end and not until():
             self._executor.spin_once(timeout_sec=0.02)
 
     def done(self, future: Any, seconds: float) -> Any:
-        """Result of a future."""
+        """Wait for the result of a future."""
         self._executor.spin_until_future_complete(future, timeout_sec=seconds)
         return future.result()
 
     def now(self) -> Any:
-        """Stamp of this moment."""
+        """Return the current time as a stamp."""
         return self.node.get_clock().now().to_msg()
 
 
 def read(seconds: float, output: Path) -> None:
-    """Store what every topic brought."""
+    """Store the received messages of all topics."""
     judge = Judge()
     found = {topic: judge.follow(topic, interface(kind), PROFILES.get(topic, 100)) for topic, kind in TOPICS.items()}
     judge.spin(seconds)
@@ -100,7 +101,7 @@ def read(seconds: float, output: Path) -> None:
 
 
 def late() -> float:
-    """Milliseconds from the first subscription until the latched topics are there."""
+    """Return the time (ms) from the first subscription until the latched topics are received."""
     judge = Judge("late")
     begin = time.monotonic()
     wanted = ("/map", "/tf_static", "/robot_description")
@@ -110,7 +111,7 @@ def late() -> float:
 
 
 def twist(kind: Any, speed: float, stamp: Any = None) -> Any:
-    """A twist forward, stamped if its kind is."""
+    """Return a forward twist, stamped if its type is."""
     message = kind()
     if kind is TwistStamped:
         message.header.frame_id = "base_link"
@@ -122,13 +123,13 @@ def twist(kind: Any, speed: float, stamp: Any = None) -> Any:
 
 
 def begin_at_a_line() -> None:
-    """Wait until the benchmark says so."""
+    """Wait for the benchmark's start line."""
     print("ready", flush=True)
     sys.stdin.readline()
 
 
 def twists(count: int) -> list[tuple[float, int]]:
-    """Drive at 20 Hz; returns speeds and times of sending."""
+    """Drive at 20 Hz; return speeds and times of sending."""
     judge, sent = Judge("driver"), []
     publisher = judge.node.create_publisher(Twist, "/cmd_vel", 1)
     judge.spin(2.0)
@@ -145,7 +146,7 @@ def twists(count: int) -> list[tuple[float, int]]:
 
 
 def hostile(seconds: float) -> int:
-    """Send stamped twists of half a minute ago, and beside another publisher twists; returns their number."""
+    """Send stamped twists half a minute old, and twists beside another publisher; return their number."""
     judges, sent = {kind: Judge(f"hostile_{kind.__name__.lower()}") for kind in (TwistStamped, Twist)}, 0
     begin_at_a_line()
     for kind, judge in judges.items():
@@ -161,7 +162,7 @@ def hostile(seconds: float) -> int:
 
 
 class Drive:
-    """Orders of a node to an armed robot."""
+    """Commands of a node to an armed robot."""
 
     def __init__(self) -> None:
         self.judge = Judge()
@@ -178,7 +179,7 @@ class Drive:
         return answer.success, answer.message
 
     def twisted(self, kind: Any) -> float:
-        """Drive at 0.1 m/s for 3 s; returns the distance by odometry, m."""
+        """Drive at 0.1 m/s for 3 s; return the distance by odometry, m."""
         publisher = self.judge.node.create_publisher(kind, "/cmd_vel", 1)
         self.judge.spin(1.0)
         begin = position(self.odometry[-1])
@@ -191,7 +192,7 @@ class Drive:
         return math.dist(begin, position(self.odometry[-1]))
 
     def ahead(self, *distances: float) -> list[PoseStamped]:
-        """Poses so far ahead of the robot, m."""
+        """Return poses at these distances ahead of the robot, m."""
         newest = self.poses[-1].pose.pose
         yaw = 2.0 * math.atan2(newest.orientation.z, newest.orientation.w)
         rows = []
@@ -206,7 +207,7 @@ class Drive:
         return rows
 
     def goal_pose(self, seconds: float) -> float:
-        """Send a goal 0.5 m ahead; returns the distance from it at the end, m."""
+        """Send a goal 0.5 m ahead; return the final distance from it, m."""
         publisher = self.judge.node.create_publisher(PoseStamped, "/goal_pose", 1)
         self.judge.spin(1.0)
         (goal,) = self.ahead(0.5)
@@ -217,7 +218,7 @@ class Drive:
         return math.dist(target, position(self.poses[-1]))
 
     def action(self, kind: Any, name: str, goal: Any, cancel_after: float | None = None) -> tuple[int, str, int]:
-        """Carry out an action; returns its status, its text, and the number of feedbacks."""
+        """Execute an action; return its status, its text, and the number of feedback messages."""
         self.call("arm")
         feedbacks: list[Any] = []
         client = ActionClient(self.judge.node, kind, name)
@@ -232,7 +233,7 @@ class Drive:
         return answer.status, answer.result.error_msg, len(feedbacks)
 
     def actions(self) -> dict[str, tuple[int, str, int]]:
-        """Goals driven, cancelled, refused; poses driven through; a path followed backward."""
+        """Test goals reached, cancelled and refused, poses driven through, and a path followed backward."""
         near, far, away = self.ahead(0.5, 0.9, 500.0)
         to_pose = NavigateToPose, "navigate_to_pose"
         found = {
@@ -248,7 +249,7 @@ class Drive:
 
 
 def drive() -> dict[str, object]:
-    """What an armed robot did."""
+    """Return the results of driving an armed robot."""
     order = Drive()
     figures: dict[str, object] = {"armed": order.call("arm"), "twist_m": order.twisted(Twist)}
     order.call("arm")
@@ -266,7 +267,7 @@ def drive() -> dict[str, object]:
 
 
 def main(what: str, *words: str) -> None:
-    """Carry out one part."""
+    """Run one part."""
     if what == "read":
         read(float(words[0]), Path(words[1]))
         return

@@ -1,4 +1,4 @@
-"""Nodes of ``rclpy`` in the place of Nav2 and slam_toolbox: they map, localise, and drive 0.8 m.
+"""Nodes of ``rclpy`` that replace Nav2 and slam_toolbox: they map, localise, and drive 0.8 m.
 
     PYTHON benchmarks/ros2_parts/rclpy_nav2.py
 

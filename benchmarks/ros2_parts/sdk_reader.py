@@ -1,4 +1,4 @@
-"""Reads a face by ``zenoh-ros2-sdk``, with interfaces as ``rosbags`` has them, and stores what came.
+"""Reads a face with ``zenoh-ros2-sdk``, with the interfaces of ``rosbags``, and stores the messages.
 
 python -m benchmarks.ros2_parts.sdk_reader PORT SECONDS OUTPUT
 """
@@ -20,7 +20,7 @@ FURTHER = {"map_msgs/msg/OccupancyGridUpdate": UPDATE}
 
 
 def write_definitions(folder: Path) -> None:
-    """Write the ``.msg`` files of ROS 2 Jazzy, as ``rosbags`` has them."""
+    """Write the ``.msg`` files of ROS 2 Jazzy from ``rosbags``."""
     store = get_typestore(Stores.ROS2_JAZZY)
     texts = {name: store.generate_msgdef(name, ros_version=2)[0] for name in store.fielddefs} | FURTHER
     for name, text in texts.items():
@@ -31,14 +31,14 @@ def write_definitions(folder: Path) -> None:
 
 
 def plain(value: object) -> object:
-    """A message as dictionaries, lists and arrays."""
+    """Return a message as dictionaries, lists and arrays."""
     if hasattr(value, "__dataclass_fields__"):
         return {name: plain(getattr(value, name)) for name in value.__dataclass_fields__ if name != "__msgtype__"}
     return [plain(one) for one in value] if isinstance(value, list) else value
 
 
 def main(port: int, seconds: float, output: Path) -> None:
-    """Subscribe to all topics and store what came, by topic."""
+    """Subscribe to all topics and store the messages, by topic."""
     with TemporaryDirectory() as folder:
         os.environ["HOME"] = folder  # the SDK writes into the configuration of git
         from zenoh_ros2_sdk import ROS2Subscriber  # noqa: PLC0415

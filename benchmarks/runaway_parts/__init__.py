@@ -1,1 +1,1 @@
-"""What ``runaway.py`` and the tests of the whole daemon share."""
+"""Shared code of ``runaway.py`` and the tests of the whole daemon."""

@@ -1,4 +1,4 @@
-"""One runaway in a whole daemon on the virtual clock: what the robot did, judged by the simulated world alone."""
+"""One runaway in a whole daemon on the virtual clock, judged by the simulated world alone."""
 
 import asyncio
 import math
@@ -37,7 +37,7 @@ QUIET: Final[dict[str, Any]] = {"map": None, "slam": None, "monitors": {}, "path
 
 
 class Moment(StrEnum):
-    """What ends, or does not end, the robot's motion."""
+    """Event that ends, or does not end, the robot's motion."""
 
     DRIVING = "while it drives"
     ARMED = "armed, at rest"
@@ -54,11 +54,11 @@ class Robot:
     """A robot of the trials.
 
     Args:
-        config: file below ``configs``, without its ending.
-        role: of the device whose controller disobeys.
-        speed: driven before it, m/s.
-        creep: motor speed at which it creeps, forward, rpm in the controller's own sign.
-        run: motor speed at which it runs away, likewise.
+        config: file below ``configs``, without its suffix.
+        role: role of the disobeying controller.
+        speed: speed before the fault, m/s.
+        creep: motor speed when creeping forward, rpm with the controller's sign.
+        run: motor speed when running away, likewise.
         overlay: changes of the configuration.
     """
 
@@ -72,7 +72,7 @@ class Robot:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What one trial showed; seconds and metres count from ``Trial.began``."""
+    """Result of one trial; seconds and metres count from ``Trial.began``."""
 
     speed: float
     """True speed when the fault began, m/s."""
@@ -99,7 +99,7 @@ def _base(name: str) -> SimulatedTruckConfig:
 
 
 def configured(robot: Robot, *, line: bool = False, seed: int = 0) -> SimulatedTruckConfig:
-    """Configuration of a trial."""
+    """Return the configuration of a trial."""
     base = _base(robot.config)
     known = {name: value for name, value in QUIET.items() if hasattr(base, name)}
     config = with_overlay(base, {**known, "recorder": None, "sim": {"seed": seed}})
@@ -109,7 +109,7 @@ def configured(robot: Robot, *, line: bool = False, seed: int = 0) -> SimulatedT
 
 
 class Look(NamedTuple):
-    """What the world showed at one instant."""
+    """State of the world at one instant."""
 
     at: float
     """S since the beginning."""
@@ -124,11 +124,11 @@ class Look(NamedTuple):
 
 
 class Trial:
-    """A robot that drives, disobeys and is watched.
+    """A driving robot with a fault.
 
     Args:
         rig: the robot.
-        robot: what it is.
+        robot: its description.
     """
 
     def __init__(self, rig: VirtualRig, robot: Robot) -> None:
@@ -146,22 +146,22 @@ class Trial:
         self.path: list[Look] = []
 
     def listen(self) -> None:
-        """Take what came in."""
+        """Process received messages."""
         self.states += self._gates.drain()
         self.events += self._reports.drain()
         self.stops += self._trips.drain()
 
     def forget(self) -> None:
-        """Take what came in, and drop it."""
+        """Discard received messages."""
         self.listen()
         for kept in (self.states, self.events, self.stops):
             kept.clear()  # type: ignore[attr-defined]
 
     async def arm(self) -> None:
-        """Arm as soon as that is possible.
+        """Arm as soon as possible.
 
         Raises:
-            TimeoutError: not within 20 s.
+            TimeoutError: not possible within 20 s.
         """
         async with self.clock.deadline(20.0):
             while True:
@@ -171,12 +171,12 @@ class Trial:
                 await self.clock.sleep(0.1)
 
     async def drive(self, speed: float) -> None:
-        """Drive straight ahead from now on; 0 = stay armed at rest."""
+        """Drive straight ahead from now on; 0: stay armed at rest."""
         self._requests = asyncio.create_task(self._request(speed))
         await self.clock.sleep(CRUISE)
 
     async def let_go(self) -> None:
-        """Send no more requests."""
+        """Stop sending requests."""
         if self._requests is not None:
             self._requests.cancel()
             await asyncio.wait([self._requests])
@@ -189,7 +189,7 @@ class Trial:
             await self.clock.sleep(0.05)
 
     async def order(self, order: Order) -> str:
-        """Give an order; how it was answered."""
+        """Send an order; return the answer."""
         began = self.clock.now()
         try:
             state = await self.operator.order(order)
@@ -199,7 +199,7 @@ class Trial:
         return f"{answer} after {(self.clock.now() - began) / SECOND:.1f} s"
 
     async def watch(self, seconds: float, began: int) -> None:
-        """Look at the world for a time."""
+        """Observe the world for a while."""
         end = self.clock.now() + round(seconds * SECOND)
         while self.clock.now() < end:
             truth = self.rig.world.truth(self.clock.now())
@@ -274,16 +274,16 @@ def run(robot: Robot, fault: str, moment: Moment, *, line: bool = False, seed: i
     """Run one trial.
 
     Args:
-        robot: which.
+        robot: robot of the trial.
         fault: console commands to its controller, joined by "; ".
-        moment: what happens when they are given.
-        line: the deadman line is wired.
-        seed: of the simulation's noise.
+        moment: event at the time of the fault.
+        line: whether the deadman line is wired.
+        seed: seed of the simulation's noise.
     """
     return run_virtual(lambda clock: _run(clock, robot, fault, moment, line=line, seed=seed))
 
 
 def with_speeds(robot: Robot, fault: str) -> str:
-    """A fault with the robot's own motor speeds in the place of ``CREEP``, ``RUN`` and ``BACK``."""
+    """Replace ``CREEP``, ``RUN`` and ``BACK`` in a fault by the robot's motor speeds."""
     speeds = {"CREEP": robot.creep, "RUN": robot.run, "BACK": -robot.creep}
     return " ".join(f"{speeds[word]:g}" if word in speeds else word for word in fault.split(" "))

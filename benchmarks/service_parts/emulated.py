@@ -1,8 +1,8 @@
-"""Inside the booted system: the emulated truck behind /dev/truck, and what passes its drive's wire.
+"""Inside the booted system: the emulated truck behind /dev/truck, and the traffic on its drive's wire.
 
     python emulated.py CONFIG LINES
 
-``LINES`` gets one JSON object a line, instants in s of CLOCK_MONOTONIC: ``{"t", "to_device", "hex"}`` for what passes
+``LINES`` receives one JSON object a line, times in s of CLOCK_MONOTONIC: ``{"t", "to_device", "hex"}`` for traffic on
 the drive's cable, ``{"t", "v"}`` for the true speed in m/s, 20 times a second.
 """
 
@@ -36,13 +36,13 @@ def main(config: Path, lines: Path) -> None:
 
 
 def emulated(config: Path) -> SimulatedTruckConfig:
-    """The truck of a configuration with real ports, which these emulators serve in place of the devices."""
+    """Return the truck of a configuration with real ports, served by these emulators instead of devices."""
     truck = load_config(config, TruckConfig)[0]
     return SimulatedTruckConfig.model_validate(truck.model_dump() | {"sim": SimConfig(world=WorldConfig(map="loop"))})
 
 
 def tapped(path: Path, clock: Clock, out: TextIO) -> PtyPort:
-    """A port that the group of the serial devices may open, as udev leaves it; the drive's traffic is written down."""
+    """Return a port accessible to the group of serial devices, as with udev; the drive's traffic is logged."""
     port = PtyPort(path)
     plug = port.plug
 
@@ -62,14 +62,14 @@ def tapped(path: Path, clock: Clock, out: TextIO) -> PtyPort:
 
 
 class Speeds(simulate.TruthLog):
-    """Writes the true speed down."""
+    """Logs the true speed."""
 
     def __init__(self, world: World, clock: Clock, out: TextIO) -> None:
         super().__init__(world, clock)
         self.out = out
 
     async def run(self) -> None:
-        """Until cancelled."""
+        """Run until cancelled."""
         while True:
             now = self._clock.now()
             json.dump({"t": now / SECOND, "v": self._world.truth(now).v}, self.out)

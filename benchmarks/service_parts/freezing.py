@@ -1,4 +1,4 @@
-"""Imported by every Python of the installed environment: SIGUSR1 freezes the event loop, SIGUSR2 the gate alone."""
+"""Imported by every Python of the installed environment: SIGUSR1 freezes the event loop, SIGUSR2 only the gate."""
 
 import asyncio
 import signal

@@ -1,4 +1,4 @@
-"""A Debian that boots: made by mmdebstrap, run by systemd-nspawn, both installed from Debian where they are missing."""
+"""A Debian that boots: made by mmdebstrap, run by systemd-nspawn, both installed from Debian if missing."""
 
 import os
 import shutil
@@ -21,14 +21,14 @@ Output = subprocess.CompletedProcess[str]
 
 
 class NotBootedError(Exception):
-    """What stopped it."""
+    """The machine did not boot."""
 
 
 def install_tools() -> None:
-    """Install what is missing.
+    """Install missing programs.
 
     Raises:
-        NotBootedError: not root, or Debian's packages cannot be had.
+        NotBootedError: not root, or Debian's packages are not available.
     """
     missing = sorted({package for program, package in TOOLS.items() if shutil.which(program) is None})
     if os.geteuid() != 0:
@@ -46,7 +46,7 @@ class Machine:
 
     Args:
         root: folder of the system.
-        log: gets what its console says.
+        log: receives the console's output.
     """
 
     def __init__(self, root: Path, log: Path) -> None:
@@ -55,7 +55,7 @@ class Machine:
         self._leader = 0
 
     def build(self) -> None:
-        """A new minimal Debian in the root folder, which must be empty.
+        """Make a new minimal Debian in the root folder, which must be empty.
 
         Raises:
             NotBootedError: mmdebstrap failed.
@@ -71,12 +71,12 @@ class Machine:
             raise NotBootedError(f"mmdebstrap: {done.stderr.strip()[-2000:]}")
 
     def prepare(self, folder: Path, command: Sequence[str], caches: Mapping[Path, str]) -> None:
-        """Run a command in the system that is not booted, with this computer's network.
+        """Run a command in the system before its boot, with this computer's network.
 
         Args:
-            folder: of the system, in which it is run.
+            folder: working directory in the system.
             command: program and arguments.
-            caches: folders of this computer, and where they are seen.
+            caches: folders of this computer, and their paths in the system.
 
         Raises:
             NotBootedError: it failed.
@@ -100,10 +100,10 @@ class Machine:
 
     @contextmanager
     def booted(self, within: float = 60.0) -> Iterator[None]:
-        """The container runs, with a network of its own, /sys writable for its udev.
+        """Run the container, with a separate network, and /sys writable for its udev.
 
         Raises:
-            NotBootedError: its systemd did not come up; the text is the end of its console.
+            NotBootedError: its systemd did not start; the text is the end of its console.
         """
         with self._log.open("ab") as log:
             container = subprocess.Popen(
@@ -151,7 +151,7 @@ class Machine:
         return done
 
     def show(self, unit: str, *names: str) -> dict[str, str]:
-        """Properties of a unit, of systemd itself if that is "", by systemd."""
+        """Return properties of a unit from systemd; "": of systemd itself."""
         units = [unit] if unit else []
         lines = self.run("systemctl", "show", f"--property={','.join(names)}", *units).stdout.splitlines()
         return dict(line.split("=", 1) for line in lines if "=" in line)
@@ -180,7 +180,7 @@ class Machine:
 
 
 def _is_first(pid: int) -> bool:
-    """Whether a process is the first one of a system of its own."""
+    """Whether a process is the init process of a container."""
     with suppress(OSError):
         status = Path(f"/proc/{pid}/status").read_text(encoding="ascii")
         return any(line.startswith("NSpid:") and line.endswith("\t1") for line in status.splitlines())
@@ -188,7 +188,7 @@ def _is_first(pid: int) -> bool:
 
 
 def until(condition: Callable[[], bool], within: float, every: float = 0.05) -> bool:
-    """Whether the condition becomes true within so many seconds."""
+    """Whether the condition becomes true within this time (s)."""
     end = monotonic() + within
     while not condition():
         if monotonic() > end:

@@ -1,4 +1,4 @@
-"""Where each method says the robot was: wheels, kiss-icp seeded by them, ours, ours with kiss-icp as scan matcher."""
+"""Trajectories by each method: wheels, kiss-icp seeded by them, ours, ours with kiss-icp as scan matcher."""
 
 import time
 from collections.abc import Callable
@@ -58,12 +58,12 @@ class Run:
 
 
 def wheels(log: Log) -> Run:
-    """Odometry as it is."""
+    """Return unmodified odometry."""
     return Run(log.name, "wheels", log.stamps, log.odom, 0.0)
 
 
 def kiss(log: Log) -> Run:
-    """kiss-icp, every point kept, every guess from the wheels."""
+    """Run kiss-icp, with all points, and guesses from the wheels."""
     odometry, poses, times = KissOdometry(), [np.zeros(3)], []
     for k, ranges in enumerate(log.ranges):
         delta = between(log.odom[k - 1], log.odom[k]) if k else np.zeros(3)
@@ -75,7 +75,7 @@ def kiss(log: Log) -> Run:
 
 
 def ours(log: Log, front: Callable[[], ScanMatcher] = PlanarMatcher, method: str = "ours") -> Run:
-    """Our mapper with its defaults, scan by scan, then the joint registration at the end."""
+    """Run our mapper with its defaults, scan by scan, then the joint registration at the end."""
     warm = Mapper()
     for k in range(3):
         warm.step(prepare(log.ranges[0], log.geometry), k, np.zeros(3))
@@ -122,7 +122,7 @@ def ours(log: Log, front: Callable[[], ScanMatcher] = PlanarMatcher, method: str
 
 
 def graph_ms(mapper: Mapper) -> float | None:
-    """Processor time, ms, to settle the first 1000 keyframes' graph after a push; None if there are fewer."""
+    """Return the processor time (ms) to settle the graph of the first 1000 keyframes; None for fewer."""
     if len(mapper.map) < NODES:
         return None
     edges = mapper.map.edges.edges()
@@ -138,7 +138,7 @@ def graph_ms(mapper: Mapper) -> float | None:
 
 
 def ours_by_kiss(log: Log) -> Run:
-    """Our mapper with kiss-icp as scan matcher (``front: kiss``)."""
+    """Run our mapper with kiss-icp as scan matcher (``front: kiss``)."""
     return ours(log, KissMatcher, "front: kiss")
 
 
@@ -147,12 +147,12 @@ METHODS = COMPARED | {"again": ours}
 
 
 def job(folder: Path, name: str, method: str) -> Run:
-    """One method on one log, in a process of its own."""
+    """Run one method on one log, in a separate process."""
     return METHODS[method](load(folder, name))
 
 
 def run(folder: Path, out: Path, names: tuple[str, ...]) -> tuple[dict[str, float], dict[str, float], bool]:
-    """Print a table and draw plots; figures, goals, and whether all are met."""
+    """Print a table and draw plots; return figures, goals, and whether all are met."""
     methods = [(name, method) for name in names for method in COMPARED]
     again = "aces" if "aces" in names else names[0]
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
@@ -199,7 +199,7 @@ def _tell(log: Log, done: Run, score: dict[str, float]) -> None:
 
 
 def draw(log: Log, runs: list[Run], file: Path) -> None:
-    """Trajectories, and our map under ours."""
+    """Draw the trajectories, and our map below ours."""
     figure = new_figure(15, 5.4)
     for axes, done in zip(figure.subplots(1, len(runs)), runs, strict=True):
         axes.plot(*done.points.T, "k,", alpha=0.4)

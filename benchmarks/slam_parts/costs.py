@@ -1,4 +1,4 @@
-"""What mapping costs: grid against a plain Bresenham in numba, front end, whole daemon on the virtual clock."""
+"""Cost of mapping: grid against a plain Bresenham in numba, front end, whole daemon on the virtual clock."""
 
 import time
 from pathlib import Path
@@ -25,7 +25,7 @@ GOALS = {"grid_over_bresenham": 1.2, "grid_us": 90.0, "step_median_ms": 8.0, "da
 
 @njit
 def bresenham(grid, x0, y0, ends):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN201
-    """The yardstick: every beam's cells one down, its end up, limited."""
+    """Baseline: decrement the cells of every beam, increment its end, with limits."""
     for i in range(ends.shape[0]):
         x, y, x1, y1 = x0, y0, ends[i, 0], ends[i, 1]
         dx, dy = abs(x1 - x), -abs(y1 - y)
@@ -44,7 +44,7 @@ def bresenham(grid, x0, y0, ends):  # type: ignore[no-untyped-def] # noqa: ANN00
 
 
 def grid_cost() -> dict[str, float]:
-    """Processor time of one scan of 682 beams at 5.6 m, interleaved with the yardstick's."""
+    """Return the processor time of one scan of 682 beams at 5.6 m, interleaved with the baseline's."""
     angles = np.deg2rad(np.linspace(-120, 120, BEAMS))
     points = np.stack((np.cos(angles), np.sin(angles)), axis=-1) * (RANGE - 0.02 + 0.02 * np.sin(9 * angles))[:, None]
     ours, plain, sensor = OccupancyGrid(), np.zeros((256, 256), np.int16), np.zeros(2)
@@ -60,7 +60,7 @@ def grid_cost() -> dict[str, float]:
 
 
 def step_cost(recording: Path) -> dict[str, float]:
-    """Processor time of preparation, matching, closing and drawing per recorded scan."""
+    """Return the processor time of preparation, matching, closing and drawing per recorded scan."""
     estimator, times = MappingEstimator(MapperConfig(), GridConfig()), []
     for scan in read_scans(recording).scans:
         begin = time.thread_time_ns()
@@ -71,7 +71,7 @@ def step_cost(recording: Path) -> dict[str, float]:
 
 
 def daemon_cost() -> dict[str, float]:
-    """Seconds of the mapping demo per second of real time, and per second of the daemon's and the world's processor."""
+    """Return the speed of the mapping demo relative to real time, and to the processor time of daemon and world."""
     config, _ = load_config(ROOT / "configs" / "slam.yaml", SimulatedTruckConfig)
     config = config.model_copy(update={"recorder": None, "map": None})
 
@@ -88,7 +88,7 @@ def daemon_cost() -> dict[str, float]:
 
 
 def run(recording: Path) -> tuple[dict[str, float], dict[str, float], bool]:
-    """Figures, goals, and whether all are met."""
+    """Return figures, goals, and whether all are met."""
     figures = grid_cost() | step_cost(recording) | daemon_cost()
     met = figures["grid_over_bresenham"] <= 1.2 or figures["grid_us"] <= 90
     met &= figures["step_median_ms"] <= 8.0 and figures["daemon_speed"] >= 8.0

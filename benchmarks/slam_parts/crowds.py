@@ -1,9 +1,9 @@
-"""Mapping among people who walk in drawn logs (``drawn``): along with the robot, against it and across its path.
+"""Mapping among walking people in drawn logs (``drawn``): along with the robot, against it and across its path.
 
-People are discs that walk along the robot's own path, so no wall is in their way: ahead or behind at its speed, the
-other way, or across. There are as many as hide ``SHARES`` of the beams; in logs of an odd seed they come after a third
-of the time. Wheels are right, so every scan at which they are dropped counts; a live pose that is wrong by more than
-``WRONG`` must be reported within ``UNREPORTED``.
+People are discs that walk along the robot's own path, so no wall is in their way: ahead or behind at its speed, in the
+opposite direction, or across. Their number hides ``SHARES`` of the beams; in logs of an odd seed they appear after a
+third of the time. Wheels are right, so every scan at which they are rejected counts; a live pose that is wrong by more
+than ``WRONG`` must be reported within ``UNREPORTED``.
 """
 
 import math
@@ -34,7 +34,7 @@ WRONG, UNREPORTED = 0.10, 3.0
 
 
 def run(folder: Path, *, quick: bool) -> tuple[dict[str, float], dict[str, float], bool]:
-    """Figures, goals, and whether all are met."""
+    """Return figures, goals, and whether all are met."""
 
     def cases(log: tuple, name: str, seed: int) -> Iterator[tuple[str, dict[str, float], dict[str, float]]]:
         for share in (0.0, *SHARES):
@@ -47,7 +47,7 @@ def run(folder: Path, *, quick: bool) -> tuple[dict[str, float], dict[str, float
 def followed(
     log: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, ScanGeometry], name: str, seed: int, share: float
 ) -> dict[str, float]:
-    """Errors of the live pose, m, how long it was wrong and unreported, s, and the number of scans without wheels."""
+    """Return errors of the live pose (m), time wrong and unreported (s), and the number of scans without wheels."""
     stamps, ranges, odometry, poses, geometry = log
     rng = np.random.default_rng((seed, len(name), round(100 * share)))
     seen, hidden = among(ranges[:SCANS], poses, geometry, share, rng, SCANS // 3 * (seed % 2))
@@ -72,7 +72,7 @@ def followed(
 
 
 def longest(marks: np.ndarray) -> int:
-    """Length of the longest row of marks."""
+    """Return the length of the longest run of marks."""
     best = row = 0
     for mark in marks.tolist():
         row = row + 1 if mark else 0
@@ -83,7 +83,7 @@ def longest(marks: np.ndarray) -> int:
 def among(
     ranges: np.ndarray, poses: np.ndarray, geometry: ScanGeometry, share: float, rng: np.random.Generator, since: int
 ) -> tuple[np.ndarray, float]:
-    """Ranges, shape (n, beams), among people from scan ``since`` on, and the share of those beams that meet one."""
+    """Return ranges, shape (n, beams), among people from scan ``since`` on, and the share of beams that hit one."""
     seen = ranges.copy()
     here = poses[: len(ranges)]
     hidden = 0.0
@@ -98,7 +98,7 @@ def among(
 
 
 def _walk(poses: np.ndarray, count: int, kind: str, rng: np.random.Generator) -> np.ndarray:
-    """Places, shape (count, 2), of a person at every scan, m."""
+    """Return the places, shape (count, 2), of a person at every scan, m."""
     scans = np.arange(count)
     lead, aside = rng.integers(8, 40), rng.uniform(-0.6, 0.6)
     at = np.full(count, 0)
@@ -116,7 +116,7 @@ def _walk(poses: np.ndarray, count: int, kind: str, rng: np.random.Generator) ->
 
 
 def _met(people: np.ndarray, poses: np.ndarray, geometry: ScanGeometry, beams: int) -> np.ndarray:
-    """Distance, shape (n, beams), of every beam to the person; ``REACH`` + 1 where it does not meet them."""
+    """Return the distance, shape (n, beams), of every beam to the person; ``REACH`` + 1 if it misses."""
     place = between(poses, np.column_stack((people, np.zeros(len(people)))))[:, :2]
     angles = geometry.start_angle + geometry.angle_increment * np.arange(beams)
     ahead = place @ np.stack((np.cos(angles), np.sin(angles)))

@@ -1,7 +1,7 @@
 """Logs drawn by seed: a robot drives to random places of a shipped map, so its poses are known exactly.
 
-The map's cells are cast from where it was: ``BEAMS`` beams over 270 degrees to 8 m, with noise. Its odometry has wrong
-scales, a drift and noise, drawn too. Nothing moves; scans are taken at an instant.
+The map's cells are ray-cast from the true poses: ``BEAMS`` beams over 270 degrees to 8 m, with noise. The odometry has
+drawn scale errors, drift and noise. Nothing else moves; each scan is taken at one instant.
 """
 
 import math
@@ -32,7 +32,7 @@ SCALES, DRIFT, JITTER = (0.02, 0.03), 0.01, (0.03, 0.004)
 
 
 def drawn(folder: Path, name: str, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, ScanGeometry]:
-    """Stamps (n,), ns, ranges (n, beams), odometry (n, 3), poses (n, 3), and the geometry, in a map of ``folder``."""
+    """Return stamps (n,), ns, ranges (n, beams), odometry (n, 3), poses (n, 3), and geometry in a map."""
     rng = np.random.default_rng((seed, len(name)))
     world = load_map(folder / f"{MAPS[name]}.yaml")
     poses = _along(_way(world, rng))
@@ -47,9 +47,9 @@ def drawn(folder: Path, name: str, seed: int) -> tuple[np.ndarray, np.ndarray, n
 def over_drives(
     folder: Path, part: str, seeds: int, measure: Callable[[tuple, str, int], Iterator[tuple[str, Found, Found]]]
 ) -> tuple[Found, Found, bool]:
-    """Figures and goals of ``part`` in every map, for so many seeds, and whether all goals are met.
+    """Return figures and goals of ``part`` in every map, for this many seeds, and whether all goals are met.
 
-    ``measure`` gets a log, and the name of its map and its seed; it yields a case, its figures and its goals.
+    ``measure`` receives a log, and the name of its map and its seed; it yields a case, its figures and its goals.
     """
     figures: Found = {}
     goals: Found = {}
@@ -64,7 +64,7 @@ def over_drives(
 
 
 def _way(world: WorldMap, rng: np.random.Generator) -> np.ndarray:
-    """Points, shape (n, 2), of the ways of least cost between random places, ``WAY`` metres in all."""
+    """Return points, shape (n, 2), of the least-cost paths between random places, ``WAY`` metres in total."""
     factor = max(round(CELL / world.resolution), 1)
     room = (distance_transform_edt(world.cells == FREE) * world.resolution)[::factor, ::factor]
     areas, _ = label(room > CLEARANCE, np.ones((3, 3)))
@@ -97,7 +97,7 @@ def _way(world: WorldMap, rng: np.random.Generator) -> np.ndarray:
 
 
 def _along(way: np.ndarray) -> np.ndarray:
-    """Poses, shape (n, 3), along a smoothed way."""
+    """Return poses, shape (n, 3), along a smoothed path."""
     done = np.r_[0.0, np.cumsum(np.hypot(*np.diff(way, axis=0).T))]
     fine = np.arange(0.0, min(float(done[-1]), WAY), 0.02)
     line = np.column_stack([np.interp(fine, done, column) for column in way.T])
@@ -110,7 +110,7 @@ def _along(way: np.ndarray) -> np.ndarray:
 
 
 def _odometry(poses: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Poses, shape (n, 3), as wheels have them."""
+    """Return poses, shape (n, 3), as measured by the wheels."""
     steps = between(poses[:-1], poses[1:])
     way = np.hypot(steps[:, 0], steps[:, 1])
     scale, turn, drift = 1.0 + rng.normal(0, SCALES[0]), 1.0 + rng.normal(0, SCALES[1]), rng.normal(0, DRIFT)
@@ -124,7 +124,7 @@ def _odometry(poses: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 @njit(cache=True)
 def _cast(occupied, resolution, origin, poses, angles, reach):  # noqa: ANN001, ANN202
-    """Distances, shape (n, beams), to the first occupied cell on the way, exactly; more than ``reach`` = none."""
+    """Return exact distances, shape (n, beams), to the first occupied cell; more than ``reach`` if there is none."""
     rows, columns = occupied.shape
     ranges = np.full((poses.shape[0], angles.shape[0]), reach + 1.0)
     for k in range(poses.shape[0]):

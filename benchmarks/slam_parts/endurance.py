@@ -1,8 +1,8 @@
-"""Two hours of driving round and round: does the mapper's memory stay bounded?
+"""Two hours of driving in circles: the mapper's memory must stay bounded.
 
-A truck with drifting wheels follows one closed way through the rooms of the emulators' world, ten scans a second; every
-pass adds keyframes until the most dispensable have to go. The estimation worker runs in this process, whose resident
-memory is taken once in ten minutes.
+A truck with drifting wheels follows a closed path through the rooms of the emulators' world, with ten scans a second;
+every lap adds keyframes until the least useful ones are removed. The estimation worker runs in this process, whose
+resident memory is sampled every ten minutes.
 """
 
 import os
@@ -29,7 +29,7 @@ GOALS = {"endurance_growth_mb": 10.0}
 
 
 def way() -> np.ndarray:
-    """Poses along the closed way, one a scan, shape (n, 3)."""
+    """Return poses along the closed path, one for each scan, shape (n, 3)."""
     corners = np.array((*ROOMS, ROOMS[0]))
     lengths = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(corners, axis=0).T))))
     stations = np.arange(0.0, lengths[-1], SPEED * PERIOD)
@@ -41,12 +41,12 @@ def way() -> np.ndarray:
 
 
 def resident() -> float:
-    """MB of this process."""
+    """Return the resident memory of this process, MB."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def run() -> tuple[dict[str, float], dict[str, float], bool]:
-    """Figures, goals, and whether all are met."""
+    """Return figures, goals, and whether all are met."""
     world, poses, rng = load_map(MAP), way(), np.random.default_rng(1)
     clear, (left, low) = clearance(world.cells == OCCUPIED), world.origin[:2]
     worker = SlamWorker()

@@ -71,7 +71,7 @@ LEAST = {"information_ratio": 1.0, "free_ratio": 1.0}
 
 
 def played(folder: Path) -> tuple[list[LaserScan], np.ndarray, np.ndarray, float]:
-    """Scans as the daemon saw them; stamps (n,) and poses (n, 3) that it reported; seconds of real time per second."""
+    """Return the daemon's scans, their stamps (n,) and reported poses (n, 3), and seconds of real time per second."""
     config, _ = load_config(CONFIG, SimulatedTruckConfig)
     config = config.model_copy(update={"recorder": None, "slam": SlamConfig(save=folder)})
     assert config.sim.recording is not None
@@ -93,7 +93,7 @@ def played(folder: Path) -> tuple[list[LaserScan], np.ndarray, np.ndarray, float
 
 
 def settled(folder: Path, stamps: np.ndarray, reported: np.ndarray) -> np.ndarray:
-    """The poses that were reported, moved as the saved graph has moved the keyframes before and after each."""
+    """Return the reported poses, corrected as the saved graph has corrected the adjacent keyframes."""
     graph = load(folder).graph
     at = np.clip(np.searchsorted(graph.stamps, stamps, side="right") - 1, 0, len(graph.stamps) - 2)
     then = interpolate(stamps, reported, graph.stamps.astype(float))
@@ -105,7 +105,7 @@ def settled(folder: Path, stamps: np.ndarray, reported: np.ndarray) -> np.ndarra
 
 
 def points_of(scan: LaserScan, longest: float, mount: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points, shape (n, 2), in base, and the instant of each, ns."""
+    """Return points, shape (n, 2), in base, and the time of each, ns."""
     angles = scan.start_angle + scan.angle_increment * np.arange(len(scan.ranges))
     good = np.flatnonzero((scan.ranges >= scan.range_min) & (scan.ranges <= min(scan.range_max, longest)))
     r, a = scan.ranges[good], angles[good]
@@ -114,12 +114,12 @@ def points_of(scan: LaserScan, longest: float, mount: float) -> tuple[np.ndarray
 
 
 def middle(scan: LaserScan) -> float:
-    """Instant of the middle of the sweep, ns."""
+    """Return the time of the middle of the sweep, ns."""
     return scan.stamp + SECOND * scan.time_increment * (len(scan.ranges) - 1) / 2
 
 
 def kiss_poses(scans: list[LaserScan], mount: float) -> np.ndarray:
-    """kiss-icp with all points: its second downsampling is left out; poses (n, 3) of base."""
+    """Run kiss-icp with all points, without its second downsampling; return poses (n, 3) of base."""
     config = KISSConfig()
     config.data.max_range, config.data.min_range, config.data.deskew = 5.6, 0.0, False
     config.mapping.voxel_size = 0.1
@@ -136,7 +136,7 @@ def kiss_poses(scans: list[LaserScan], mount: float) -> np.ndarray:
 
 
 def drawn(scans: list[LaserScan], track: Track, mount: float, *, rigid: bool = False) -> tuple[Figures, np.ndarray]:
-    """Figures of a trajectory's map, and the map."""
+    """Return the figures of a trajectory's map, and the map."""
     stamps, poses = track
     grid = OccupancyGrid(GridConfig(limit=0.999))
     ends = []
@@ -163,7 +163,7 @@ def drawn(scans: list[LaserScan], track: Track, mount: float, *, rigid: bool = F
 
 
 def rendered(scans: list[LaserScan], track: Track, mount: float, *, rigid: bool = False) -> dict[str, np.ndarray]:
-    """Figures of a trajectory's map, each with shape (PLACEMENTS,)."""
+    """Return the figures of a trajectory's map, each with shape (PLACEMENTS,)."""
     rng = np.random.default_rng(0)
     places = rng.uniform((0.0, 0.0, -np.pi), (0.05, 0.05, np.pi), (PLACEMENTS, 3))
     stamps, poses = track
@@ -172,12 +172,12 @@ def rendered(scans: list[LaserScan], track: Track, mount: float, *, rigid: bool 
 
 
 def compared(ours: dict[str, np.ndarray], kiss: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Ours over kiss-icp's, in every place of the grid."""
+    """Return the ratios of our figures to kiss-icp's, for every placement of the grid."""
     return {f"{key}_ratio": value / np.maximum(kiss[key], 1e-12) for key, value in ours.items()}
 
 
 def mapped(scans: list[LaserScan], mount: float, front: str = "planar") -> Track:
-    """What the mapper with this front end makes of ``scans`` without the daemon."""
+    """Run the mapper with this front end on ``scans``, without the daemon."""
     estimator = MappingEstimator(SlamConfig().mapper, GridConfig(), matcher_of(front))
     for scan in scans:
         inputs = ScanInput.of(scan, (mount, 0.0, 0.0))
@@ -188,7 +188,7 @@ def mapped(scans: list[LaserScan], mount: float, front: str = "planar") -> Track
 
 
 def dithered(scans: list[LaserScan], mount: float, seed: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Figures of ours and of kiss-icp's map of ``scans`` with what rounding to a millimetre may have taken."""
+    """Return the figures of our and kiss-icp's maps of ``scans`` with random rounding residuals."""
     rng = np.random.default_rng(seed)
     others = [
         scan.model_copy(update={"ranges": scan.ranges + rng.uniform(-5e-4, 5e-4, len(scan.ranges))}) for scan in scans
@@ -200,7 +200,7 @@ def dithered(scans: list[LaserScan], mount: float, seed: int) -> tuple[dict[str,
 
 
 def against_wheels(recording: Path, poses: np.ndarray) -> tuple[float, float, float]:
-    """Differences of turn (rad) and way ahead (m) over ``SPAN`` scans from those by the ticks, and the scale."""
+    """Return differences of turn (rad) and distance (m) over ``SPAN`` scans from the ticks, and the scale."""
     time_us, left, right = np.loadtxt(recording, usecols=(0, 2, 3), unpack=True)
     yaw = np.unwrap(poses[:, 2])
     way = np.append(0.0, np.cumsum(between(poses[:-1], poses[1:])[:, 0]))
@@ -218,7 +218,7 @@ def against_wheels(recording: Path, poses: np.ndarray) -> tuple[float, float, fl
 
 
 def draw(maps: dict[str, np.ndarray], file: Path) -> None:
-    """The maps side by side."""
+    """Draw the maps side by side."""
     figure = new_figure(11, 5.2)
     for axes, (name, cells) in zip(figure.subplots(1, len(maps)), maps.items(), strict=True):
         shades = np.where(cells < 0, 0.8, 1 - cells / 100)
@@ -230,7 +230,7 @@ def draw(maps: dict[str, np.ndarray], file: Path) -> None:
 
 
 def run(picture: Path | None = None) -> tuple[dict[str, float], dict[str, float], bool]:
-    """Figures, goals, and whether all are met."""
+    """Return figures, goals, and whether all are met."""
     mount = 0.145
     with TemporaryDirectory() as folder:
         scans, stamps, reported, speed = played(Path(folder))

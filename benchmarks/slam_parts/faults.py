@@ -57,7 +57,7 @@ NEVER = 1e6
 
 @dataclass(frozen=True)
 class Mapping:
-    """What the mapper said, scan by scan."""
+    """Output of the mapper, scan by scan."""
 
     live: np.ndarray
     """Shape (n, 3), as said at each scan."""
@@ -72,7 +72,7 @@ class Mapping:
 
 
 def kidnap(folder: Path, *, quick: bool, logs: Sequence[str] = LOGS) -> Found:
-    """Figures, goals, and whether all are met."""
+    """Return figures, goals, and whether all are met."""
     figures: dict[str, float] = {}
     goals: dict[str, float] = {}
     for name in LOGS[:1] if quick else logs:
@@ -104,7 +104,7 @@ def kidnap(folder: Path, *, quick: bool, logs: Sequence[str] = LOGS) -> Found:
 def kidnapped(
     folder: Path, name: str, quick: bool, whole: np.ndarray, share: float
 ) -> tuple[float, float, float, bool, float]:
-    """Run one cut: longest time wrong and unreported, time lost, s; error, m; whether all was joined; ms per scan."""
+    """Run one cut: time wrong and unreported (s), time lost (s), error (m), whether all was joined, ms per scan."""
     log, first, kept = cut(read(folder, name, quick=quick), share)
     found = mapped(log, log.odom)
     seconds = log.stamps / SECOND
@@ -125,7 +125,7 @@ def kidnapped(
 
 
 def cut(log: Log, share: float) -> tuple[Log, int, np.ndarray]:
-    """The log without ``CUT`` from a share of its time on; its first scan behind, and the indices of its scans."""
+    """Return the log without ``CUT`` seconds, its first scan after the cut, and the indices of its scans."""
     seconds = log.stamps / SECOND
     first = int(np.searchsorted(seconds, share * seconds[-1]))
     last = int(np.searchsorted(seconds, seconds[first] + CUT))
@@ -136,7 +136,7 @@ def cut(log: Log, share: float) -> tuple[Log, int, np.ndarray]:
 
 
 def wrong_odometry(folder: Path, *, quick: bool, logs: Sequence[str] = LOGS) -> Found:
-    """Figures, goals, and whether all are met."""
+    """Return figures, goals, and whether all are met."""
     figures: dict[str, float] = {}
     goals: dict[str, float] = {}
     for name in LOGS[:1] if quick else logs:
@@ -157,7 +157,7 @@ def wrong_odometry(folder: Path, *, quick: bool, logs: Sequence[str] = LOGS) -> 
 
 
 def misled(folder: Path, name: str, quick: bool, kind: str) -> tuple[float, float]:
-    """Error, m, with one kind of odometry, and after how many seconds a fault was reported."""
+    """Return the error (m) with one kind of odometry, and the time until a fault was reported (s)."""
     log = read(folder, name, quick=quick)
     odom = None if kind == "scans alone" else wrong(log.odom, kind, log.stamps)
     found = mapped(log, odom)
@@ -177,7 +177,7 @@ def misled(folder: Path, name: str, quick: bool, kind: str) -> tuple[float, floa
 
 
 def wrong(odom: np.ndarray, kind: str, stamps: np.ndarray) -> np.ndarray:
-    """Odometry, shape (n, 3), with a fault."""
+    """Return odometry, shape (n, 3), with a fault."""
     if kind == "nan":
         seconds = stamps / SECOND - NAN[0] * stamps[-1] / SECOND
         return np.where(((seconds >= 0.0) & (seconds < NAN[1]))[:, None], np.nan, odom)
@@ -208,14 +208,14 @@ def mapped(log: Log, odom: np.ndarray | None) -> Mapping:
 
 
 def read(folder: Path, name: str, *, quick: bool) -> Log:
-    """A log, or its beginning."""
+    """Return a log, or its beginning."""
     log = load(folder, name)
     some = slice(QUICK_SCANS if quick else None)
     return replace(log, stamps=log.stamps[some], ranges=log.ranges[some], odom=log.odom[some])
 
 
 def error(log: Log, stamps: np.ndarray, poses: np.ndarray) -> float:
-    """Mean error by relations, or median distance from poses, of the references at instants that were mapped, m."""
+    """Return the mean error by relations, or the median distance from poses, of the mapped references, m."""
     seconds, times = stamps / SECOND, log.reference[:, : 2 if log.by_relations else 1]
     after = np.clip(np.searchsorted(seconds, times), 1, len(seconds) - 1)
     inside = (times >= seconds[after - 1] - 1e-3) & (times <= seconds[after] + 1e-3)
@@ -225,7 +225,7 @@ def error(log: Log, stamps: np.ndarray, poses: np.ndarray) -> float:
 
 
 def in_parallel(call, values: list) -> list:  # noqa: ANN001
-    """Results in the order of the values, by two processes."""
+    """Return results in the order of the values, computed by two processes."""
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         return list(pool.map(call, values))
 

@@ -1,4 +1,4 @@
-"""The yardstick: the kiss-icp package as it is, but for its second downsampling, every guess from the wheels."""
+"""The baseline: the kiss-icp package without its second downsampling, with guesses from the wheels."""
 
 import math
 
@@ -15,7 +15,7 @@ RANGE = 30.0
 
 
 class KissOdometry:
-    """Scan after scan against the package's own map; no loop closure, no doubt."""
+    """Registers scan after scan to the package's own map, without loop closures or failure detection."""
 
     def __init__(self) -> None:
         config = KISSConfig()
@@ -28,7 +28,7 @@ class KissOdometry:
         self._pose = np.eye(4)
 
     def register(self, points: np.ndarray, delta: np.ndarray) -> np.ndarray:
-        """Motion, shape (3,), since the last scan, from the guess ``delta`` (shape (3,)); ``points``: shape (n, 2)."""
+        """Return the motion, (3,), since the last scan, from the guess ``delta``, (3,); ``points``: shape (n, 2)."""
         cloud = np.column_stack((points, np.zeros(len(points))))
         guess = self._pose @ _matrix(delta)
         sigma = self._threshold.get_threshold()

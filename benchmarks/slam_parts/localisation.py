@@ -45,7 +45,7 @@ AT_LEAST = ("localise.right_share", "localise.outside_share")
 
 @dataclass(frozen=True)
 class Mapped:
-    """A log with its truth, and a map of a stretch of it."""
+    """A log with its truth, and a map of a part of it."""
 
     log: Log
     poses: np.ndarray
@@ -55,7 +55,7 @@ class Mapped:
 
 
 def mapped(log: Log, poses: np.ndarray, share: tuple[float, float], *, graph: bool) -> Mapped:
-    """The map of a ``share`` (from, to) of the log, of keyframes or of its grid alone."""
+    """Return the map of a ``share`` (from, to) of the log, made of keyframes or of its grid alone."""
     first, last = (round(part * len(poses)) for part in share)
     builder, kept, scans = GridBuilder(GridConfig()), [], []
     for k in range(first, last):
@@ -71,7 +71,7 @@ def mapped(log: Log, poses: np.ndarray, share: tuple[float, float], *, graph: bo
 
 
 def truth(log: Log) -> np.ndarray:
-    """Poses, shape (n, 3), of all scans by the mapper, wheels, and the joint registration of the whole log."""
+    """Return the poses, shape (n, 3), of all scans by mapper, wheels, and the joint registration of the whole log."""
     mapper = Mapper()
     for stamp, ranges, odom in zip(log.stamps.tolist(), log.ranges, log.odom, strict=True):
         mapper.step(prepare(ranges, log.geometry, longest=30.0), stamp, odom)
@@ -91,10 +91,10 @@ def error(pose: np.ndarray, estimate: SlamEstimate) -> tuple[bool, bool]:
 
 
 def followed(case: Mapped, start: int, *, wheels: bool) -> dict[str, float | str]:
-    """What one robot believed: outcome, way and time of the fix.
+    """Return one robot's result: outcome, distance and time of the fix.
 
-    right, wrong at the first pose, lost behind it, uncertain (off by no more than it said); searching at a place of the
-    map, between (it skirted the map), outside, or silent of being outside.
+    right; wrong at the first pose; lost after it; uncertain (off by no more than it stated); searching at a place of
+    the map; between (along the edge of the map); outside; or silent about being outside.
     """
     log, geometry = case.log, case.log.geometry
     submap = submap_of(case.saved)
@@ -138,7 +138,7 @@ def followed(case: Mapped, start: int, *, wheels: bool) -> dict[str, float | str
 
 
 def run(folder: Path, *, quick: bool = False) -> tuple[dict[str, float], dict[str, float], bool]:
-    """All variants; figures, goals and whether they are met."""
+    """Run all variants; return figures, goals and whether they are met."""
     log = load(folder, "intel1")
     poses = truth(log)
     short = replace(log, geometry=replace(log.geometry, range_max=5.6))

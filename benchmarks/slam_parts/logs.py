@@ -1,4 +1,4 @@
-"""The logs: where they come from, that they are the very ones, and how they are evaluated."""
+"""The logs: origin, verification by checksum, and evaluation."""
 
 import gzip
 import hashlib
@@ -63,7 +63,7 @@ class Log:
 
 
 def verified(folder: Path) -> None:
-    """Raise SystemExit unless ``folder`` has exactly the files of the manifest."""
+    """Raise SystemExit unless ``folder`` contains exactly the files of the manifest."""
     for name, (digest, origin) in MANIFEST.items():
         path = folder / name
         if not path.exists():
@@ -74,7 +74,7 @@ def verified(folder: Path) -> None:
 
 
 def load(folder: Path, name: str) -> Log:
-    """``intel`` (joined), ``intel1`` (the first 1088 s), ``intel4`` (those cut to 4 m), ``aces`` or ``csail``.
+    """Load ``intel`` (joined), ``intel1`` (the first 1088 s), ``intel4`` (those cut to 4 m), ``aces`` or ``csail``.
 
     Or MAP-SEED: a drive drawn through a map of the folder ``maps`` beside ``folder``, see ``drawn``.
     """
@@ -103,7 +103,7 @@ def load(folder: Path, name: str) -> Log:
 
 
 def scored(log: Log, stamps: np.ndarray, poses: np.ndarray) -> dict[str, float]:
-    """Errors of a trajectory: by relations (m, degrees), or distance from the reference poses (m)."""
+    """Return the errors of a trajectory: by relations (m, degrees), or distance from the reference poses (m)."""
     seconds = stamps / SECOND
     if not log.by_relations:
         off = deviation(interpolate(seconds, poses, log.reference[:, 0]), log.reference[:, 1:])
@@ -124,7 +124,7 @@ def scored(log: Log, stamps: np.ndarray, poses: np.ndarray) -> dict[str, float]:
 
 
 def statistics(errors: np.ndarray) -> dict[str, float]:
-    """Mean, standard deviation, median and 95 %."""
+    """Return mean, standard deviation, median and 95th percentile."""
     return {
         "mean": float(errors.mean()),
         "std": float(errors.std()),
@@ -134,7 +134,7 @@ def statistics(errors: np.ndarray) -> dict[str, float]:
 
 
 def deviation(poses: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Distances, shape (n,), after the one rigid motion that brings ``poses`` nearest to ``reference``."""
+    """Return the distances, shape (n,), after the rigid motion that best aligns ``poses`` with ``reference``."""
     a, b = poses[:, :2] - poses[:, :2].mean(axis=0), reference[:, :2] - reference[:, :2].mean(axis=0)
     left, _, right = np.linalg.svd(a.T @ b)
     turn = right.T @ np.diag((1.0, np.linalg.det(right.T @ left.T))) @ left.T

@@ -1,9 +1,9 @@
-"""Tracking across the edge of a map: robots that know where they are drive off the ground that is mapped.
+"""Tracking across the edge of a map: localised robots leave the mapped ground.
 
-Maps are of stretches of a log, as in ``localisation``, and the whole log's trajectory is the truth. A robot starts
-at its true pose where the map is, with less than half of a scan on the map within ``SOON`` metres, and is followed over
-``WAY`` metres until it says that it is lost. A pose is hidden wrong if it is off by more than 0.5 m or 10 degrees, and
-by more than three standard deviations of its own covariance.
+Maps are of parts of a log, as in ``localisation``, and the whole log's trajectory is the truth. A robot starts at its
+true pose on the map, with less than half of a scan on the map within ``SOON`` metres, and is followed over ``WAY``
+metres until it reports that it is lost. A pose is hidden wrong if it is off by more than 0.5 m or 10 degrees, and by
+more than three standard deviations of its own covariance.
 """
 
 import math
@@ -32,14 +32,14 @@ GOALS = {f"map_edge.{log}.{kind}.hidden_share": 0.01 for log in LOGS for kind in
 
 
 def overlaps(case: Mapped) -> np.ndarray:
-    """Share of every scan of the log, shape (n,), that fits the map at its true pose."""
+    """Return the share of every scan of the log, shape (n,), that fits the map at its true pose."""
     cloud, geometry = submap_of(case.saved).cloud, case.log.geometry
     scans = (prepare(ranges, geometry, longest=30.0) for ranges in case.log.ranges)
     return np.array([measure(scan, cloud, pose).overlap for scan, pose in zip(scans, case.poses, strict=True)])
 
 
 def starts(case: Mapped, count: int) -> list[int]:
-    """Scans on the map from which the log soon leaves it."""
+    """Return the scans on the map from which the log soon leaves it."""
     overlap = overlaps(case)
     way = np.r_[0.0, np.cumsum(np.hypot(*np.diff(case.poses[:, :2], axis=0).T))]
     soon = np.searchsorted(way, way + SOON)
@@ -53,7 +53,7 @@ def starts(case: Mapped, count: int) -> list[int]:
 
 
 def tracked(case: Mapped, start: int, *, wheels: bool) -> list[tuple[bool, bool]]:
-    """Return for every pose that one robot published whether it is wrong, and whether its covariance hides that."""
+    """Return, for every pose published by one robot, whether it is wrong, and whether its covariance hides that."""
     log, geometry = case.log, case.log.geometry
     estimator = LocalisationEstimator(case.saved, MapperConfig(), tuple(case.poses[start].tolist()))
     way, found = 0.0, []
@@ -78,7 +78,7 @@ def tracked(case: Mapped, start: int, *, wheels: bool) -> list[tuple[bool, bool]
 
 
 def run(folder: Path, *, quick: bool = False) -> tuple[dict[str, float], dict[str, float], bool]:
-    """Both logs; figures, goals and whether they are met."""
+    """Run both logs; return figures, goals and whether they are met."""
     figures: dict[str, float] = {}
     for name in LOGS:
         log = load(folder, name)

@@ -1,7 +1,7 @@
-"""Lidars that are mounted otherwise than configured, in a minute of drawn logs (``drawn``): turned, mirrored, late.
+"""Lidars mounted differently than configured, in a minute of drawn logs (``drawn``): turned, mirrored, late.
 
-A right mount must not be reported, and no clocks that agree; a wrong one must be reported within the minute, and its
-yaw and the offset of the clocks be found.
+A correct mount and synchronous clocks must not be reported; a wrong mount must be reported within the minute, with its
+yaw and the offset of the clocks.
 """
 
 import math
@@ -25,14 +25,14 @@ YAW, OFFSET = 0.3, 0.01
 
 
 def run(folder: Path, *, quick: bool) -> tuple[dict[str, float], dict[str, float], bool]:
-    """Figures, goals, and whether all are met."""
+    """Return figures, goals, and whether all are met."""
     return over_drives(
         folder, "mounts", 1 if quick else SEEDS, lambda log, *_: ((kind, *mounted(log, kind)) for kind in KINDS)
     )
 
 
 def mounted(log: tuple, kind: str) -> tuple[dict[str, float], dict[str, float]]:
-    """Figures and goals of one drive."""
+    """Return figures and goals of one drive."""
     stamps, ranges, odometry, _, geometry = log
     yaw = math.radians(float(kind)) if kind.lstrip("-").isdigit() else 0.0
     turns, late = (-1 if kind == "mirrored" else 1), int(kind == "late")

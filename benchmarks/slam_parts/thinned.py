@@ -1,7 +1,7 @@
 """Recorded logs whole and thinned: every 2nd, 5th, 10th and 20th scan, with the wheels between them.
 
-Up to a spacing of ``SPACING`` a thinned log is to be as good as the whole one: no scan is ``lost`` where the whole log
-maps throughout, and the error is at most ``WORSE`` times as great. URG-04LX exp2 has no reference and no wheels: its
+Up to a spacing of ``SPACING``, a thinned log must be as good as the whole one: no scan is ``lost`` where the whole log
+maps throughout, and the error is at most ``WORSE`` times as large. URG-04LX exp2 has no reference and no wheels: its
 thinned logs are compared with the whole one.
 """
 
@@ -32,7 +32,7 @@ Track = tuple[np.ndarray, np.ndarray]
 
 
 def inputs(folder: Path, name: str) -> tuple[list[ScanInput], Callable[[Track], float] | None]:
-    """The scans of a log, and its error of a trajectory, m; None if it has no reference."""
+    """Return the scans of a log, and a function for the error of a trajectory, m; None if it has no reference."""
     if name == "exp2":
         return read_scans(folder / EXP2).scans, None
     log = load(folder, name)
@@ -55,7 +55,7 @@ def inputs(folder: Path, name: str) -> tuple[list[ScanInput], Callable[[Track], 
 
 
 def mapped(scans: list[ScanInput]) -> tuple[Track, dict[str, float]]:
-    """The trajectory after the joint registration, and figures of the run."""
+    """Return the trajectory after the joint registration, and figures of the run."""
     estimator, lost, off_map, times = MappingEstimator(MapperConfig(), GridConfig()), 0, 0, []
     for scan in scans:
         begin = time.thread_time()
@@ -69,7 +69,7 @@ def mapped(scans: list[ScanInput]) -> tuple[Track, dict[str, float]]:
 
 
 def run(folder: Path, names: Sequence[str]) -> tuple[dict[str, float], dict[str, float], bool]:
-    """Figures, goals, and whether all are met."""
+    """Return figures, goals, and whether all are met."""
     figures: dict[str, float] = {}
     goals: dict[str, float] = {}
     for name in names:
@@ -102,11 +102,11 @@ def run(folder: Path, names: Sequence[str]) -> tuple[dict[str, float], dict[str,
 
 
 def _spacing(poses: np.ndarray) -> tuple[float, float]:
-    """Mean motion between scans, m and rad."""
+    """Return the mean motion between scans, m and rad."""
     steps = between(poses[:-1], poses[1:])
     return float(np.hypot(steps[:, 0], steps[:, 1]).mean()), float(np.abs(steps[:, 2]).mean())
 
 
 def _from(dense: Track, track: Track) -> float:
-    """Median distance of a trajectory from the dense one at its stamps, m."""
+    """Return the median distance of a trajectory from the dense one at its stamps, m."""
     return float(np.median(deviation(track[1], interpolate(dense[0].astype(float), dense[1], track[0].astype(float)))))

@@ -67,7 +67,7 @@ AT_LEAST = ("corridor_degenerate", "kidnap_found", "kidnap_plain_found", "slip_r
 
 @dataclass
 class Run:
-    """What one robot believed on one drive."""
+    """Estimates of one robot on one drive."""
 
     stamps: list[float] = field(default_factory=list)
     poses: list[tuple[float, ...]] = field(default_factory=list)
@@ -80,7 +80,7 @@ class Run:
 
 
 class Matching:
-    """Scans to motion, as the estimation worker does it."""
+    """Scan matching, as in the estimation worker."""
 
     def __init__(self, drive: Drive, saved: Path | None = None) -> None:
         self._body = AngleHistory()
@@ -91,11 +91,11 @@ class Matching:
             self.estimator = LocalisationEstimator(load(saved), MapperConfig(), drive.start)
 
     def heed(self, attitude: Attitude) -> None:
-        """Take the tilt."""
+        """Set the tilt."""
         self._body.extend(((attitude.stamp, (attitude.roll, attitude.pitch)),))
 
     def match(self, stamp: int, ranges: Array, history: list[tuple[float, ...]] | None) -> ScanIncrement | None:
-        """Motion up to the scan; ``history`` are stamps (s) and poses of odometry, None without."""
+        """Return the motion up to the scan; ``history``: stamps (s) and poses of odometry, None without."""
         tilt = self._body.at(stamp + SWEEP // 2)
         if tilt is not None and plane_tilt(*tilt) > MAX_TILT:
             return None
@@ -121,7 +121,7 @@ class Matching:
 def _motion(
     stamp: int, history: list[tuple[float, ...]] | None
 ) -> tuple[tuple[float, float, float] | None, tuple[float, float, float]]:
-    """Base in odom when a scan began, and its velocity during the scan."""
+    """Return base in odom at the start of a scan, and its velocity during the scan."""
     if history is None or not history or history[0][0] > stamp / SECOND:
         return None, (0.0, 0.0, 0.0)
     rows = np.array(history[-32:])
@@ -132,7 +132,7 @@ def _motion(
 
 
 def run_drive(drive: Drive, subset: str, saved: Path | None = None, keep: Path | None = None) -> Run:
-    """One robot with a subset of the sensors on one drive; it localises in ``saved``, or maps, and keeps the map."""
+    """Run one robot with a subset of the sensors on one drive; it localises in ``saved``, or maps into ``keep``."""
     sensors, chassis = SUBSETS[subset], SimTruckConfig().chassis()
     x, y, yaw = drive.start
     start = Pose2D(x=x, y=y, yaw=yaw)
@@ -213,7 +213,7 @@ def _at(truth: Array, second: float) -> Array:
 
 
 def evaluated(run: Run, drive: Drive) -> dict[str, float]:
-    """ATE (m), RPE (m and degrees per metre), NEES and the greatest step of one run."""
+    """Return ATE (m), RPE (m and degrees per metre), NEES and the largest step of one run."""
     stamps, poses = np.array(run.stamps), np.array(run.poses)
     every = np.array(drive.truth)
     truth = np.array([_at(every, second) for second in stamps])
@@ -238,7 +238,7 @@ def evaluated(run: Run, drive: Drive) -> dict[str, float]:
 
 
 def _per_metre(poses: Array, truth: Array) -> Array:
-    """Errors, shape (n, 3), of the motions over a metre of true way."""
+    """Return the errors, shape (n, 3), of the motions over a metre of true distance."""
     way = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(truth, axis=0)[:, :2].T))))
     firsts = np.flatnonzero(way <= way[-1] - 1.0)[::5]
     lasts = np.searchsorted(way, way[firsts] + 1.0)
@@ -248,7 +248,7 @@ def _per_metre(poses: Array, truth: Array) -> Array:
 
 
 def run(folder: Path, *, quick: bool = False) -> tuple[dict[str, float], dict[str, float], bool]:
-    """All drives; figures, goals and whether they are met."""
+    """Run all drives; return figures, goals and whether they are met."""
     draw_corridor(folder)
     seeds = QUICK_SEEDS if quick else SEEDS
     cells: dict[tuple[str, str], list[dict[str, float]]] = {}
@@ -317,13 +317,13 @@ def _figures(
 
 
 def _slips(runs: list[tuple[Drive, Run]]) -> tuple[int, int]:
-    """Bursts of slip that were reported, and all of them."""
+    """Return the numbers of reported slip bursts and of all."""
     reported = sum(any(abs(slip - burst) < 1.0 for slip in run.slips) for drive, run in runs for burst in drive.bursts)
     return reported, sum(len(drive.bursts) for drive, _ in runs)
 
 
 def _draw(robots: dict[str, list[tuple[Drive, Run]]], file: Path) -> None:
-    """Truth and odometry of the first drive of every kind."""
+    """Draw truth and odometry of the first drive of every kind."""
     figure = new_figure(16, 8)
     for axes, (name, runs) in zip(figure.subplots(2, 4).flat, robots.items(), strict=False):
         drive, done = runs[0]

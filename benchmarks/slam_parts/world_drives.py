@@ -1,4 +1,4 @@
-"""Drives in the emulators' world without daemon or serial lines: what every sensor said, and what was true.
+"""Drives in the emulators' world without daemon or serial lines: all measurements, and the truth.
 
 The truck follows a polyline by its true pose; wheels and compass are read 20 times a second, the scanner ten times.
 """
@@ -41,7 +41,7 @@ MAZE: Route = tuple(
 
 @dataclass(frozen=True)
 class Scenario:
-    """One kind of drive."""
+    """A kind of drive."""
 
     name: str
     map: str
@@ -68,7 +68,7 @@ SCENARIOS = (
 
 @dataclass
 class Drive:
-    """Everything that was measured, in the order in which it was reported, and the truth."""
+    """All measurements in the order of their reports, and the truth."""
 
     start: tuple[float, float, float]
     reported: list[tuple[int, object]] = field(default_factory=list)
@@ -83,7 +83,7 @@ class Drive:
 
 
 class Pilot:
-    """Pulses and motor speed by pure pursuit of the truth, both axles alike."""
+    """Servo pulses and motor speed by pure pursuit on the true pose, both axles alike."""
 
     def __init__(self, config: SimTruckConfig) -> None:
         self.config = config
@@ -97,7 +97,7 @@ class Pilot:
         return servo.centre_us + servo.us_per_degree * math.degrees(angle)
 
     def steer(self, pose: tuple[float, float, float], line: Array) -> float:
-        """Set the servos; the motor's speed, rpm."""
+        """Set the servos; return the motor's speed, rpm."""
         nearest = int(np.argmin(np.hypot(*(line - pose[:2]).T)))
         ahead = min(nearest + round(LOOKAHEAD / 0.05), len(line) - 1)
         dx, dy = line[ahead] - pose[:2]
@@ -111,7 +111,7 @@ class Pilot:
 
 
 def driven(scenario: Scenario, seed: int, folder: Path) -> Drive:
-    """One drive."""
+    """Return one drive."""
     rng = generator(seed, RIG_NOISE)
     start = (*scenario.route[0], 0.0)
     bursts = [float(rng.uniform(4 + 8 * k, 9 + 8 * k)) for k in range(4)] if scenario.slips else []
@@ -134,7 +134,7 @@ def _leg(
     bursts: list[float],
     turns: float,
 ) -> float:
-    """Drive ``way`` (start and route) over a span of seconds; ``turns`` of the motor before, and those after."""
+    """Drive ``way`` (start and route) for some seconds; ``turns`` of the motor before; return those after."""
     (x, y, yaw), route = way
     place = str(folder / "corridor.yaml") if scenario.map == "corridor" else scenario.map
     truck = SimTruckConfig(motor=MotorConfig(inverted=False))
@@ -174,7 +174,7 @@ def _leg(
 def _magnet(
     place: tuple[float, float] | None, pose: tuple[float, float, float], north: float
 ) -> tuple[float, float, float]:
-    """Heading, rad, and what a magnet adds to the level field along and across it, mG."""
+    """Return the heading (rad), and a magnet's addition to the level field along and across it, mG."""
     heading = north - pose[2]
     if place is None:
         return heading, 0.0, 0.0
@@ -216,7 +216,7 @@ def _dense(route: Route) -> Array:
 
 
 def draw_corridor(folder: Path) -> None:
-    """A corridor 22 m long and 1.6 m wide without a feature, as a map file."""
+    """Write a map file of a featureless corridor, 22 m long and 1.6 m wide."""
     resolution = 0.025
     cells = np.full((round(2.0 / resolution), round(22.4 / resolution)), FREE, dtype=np.int8)
     skin = round(0.2 / resolution)

@@ -1,1 +1,1 @@
-"""The far side of ``station.py``: a robot that only publishes."""
+"""Counterpart of ``station.py``: a robot that only publishes."""

@@ -39,7 +39,7 @@ CONFIG = {
 
 
 def messages() -> dict[Topic[Any], tuple[float, dict[str, Any]]]:
-    """Rate and fields of each topic."""
+    """Return rate and fields of each topic."""
     covariance = np.zeros(9)
     pose, twist = Pose2D(x=1.0, y=2.0, yaw=0.5), Twist2D(vx=0.1, vy=0.0, wz=0.0)
     odometry = {
@@ -89,7 +89,7 @@ def messages() -> dict[Topic[Any], tuple[float, dict[str, Any]]]:
 
 
 def world() -> np.ndarray:
-    """Cells of a map as SLAM draws it: rooms with walls, free floor of varied certainty, and the unknown around."""
+    """Return map cells as drawn by SLAM: rooms with walls, free floor of varied certainty, and unknown cells."""
     cells = np.full((SIDE, SIDE), -1, np.int8)
     cells[60:340, 60:340] = RNG.integers(0, 12, (280, 280))
     cells[60:340:70, 60:340] = cells[60:340, 60:340:70] = 95
@@ -114,7 +114,7 @@ async def main(zenoh: ZenohConfig, robot: str, clock: Clock, times: float = 1.0)
 
 
 async def publish(bus: Bus, clock: Clock, topic: Topic[Message], rate: float, fields: dict[str, Any]) -> None:
-    """One topic, with stamps of now."""
+    """Publish one topic, with current stamps."""
     number = 0
     due = clock.now()
     while True:
@@ -126,7 +126,7 @@ async def publish(bus: Bus, clock: Clock, topic: Topic[Message], rate: float, fi
 
 
 async def report(control: Any, clock: Clock) -> None:
-    """Delays of control requests; both ends read one machine's monotonic clock."""
+    """Print the delays of control requests; both ends read the same monotonic clock."""
     async for request in control:
         print(clock.now() - request.stamp, flush=True)
 

@@ -2,7 +2,7 @@
 
     python -m benchmarks.thesis [--only 5.1 ...] [--quick] [--out FOLDER]
 
-Figures, plots and a page of them (index.md, index.html) go to runs/thesis. The last line is JSON.
+Figures, plots and a page of them (index.md, index.html) are written to runs/thesis. The last line is JSON.
 """
 
 import argparse
@@ -100,12 +100,12 @@ def write_report(out: Path) -> None:
 
 
 def marked(text: str) -> str:
-    """As HTML; what stands between backticks is code."""
+    """Convert to HTML; text between backticks becomes code."""
     return CODE.sub(r"<code>\1</code>", html.escape(text))
 
 
 def tables(figures: dict[str, float]) -> list[tuple[list[str], dict[str, dict[str, float]]]]:
-    """Columns and rows of figures named ``row.measure``: rows that have a measure in common are one table."""
+    """Return columns and rows of figures named ``row.measure``: rows with a common measure share a table."""
     rows: dict[str, dict[str, float]] = {}
     for key, value in figures.items():
         row, _, measure = key.rpartition(".")
@@ -123,12 +123,12 @@ def tables(figures: dict[str, float]) -> list[tuple[list[str], dict[str, dict[st
 
 
 def key_of(row: str, measure: str) -> str:
-    """The figure's name."""
+    """Return the figure's name."""
     return f"{row}.{measure}" if row else measure
 
 
 def cell(value: float | None, goal: float | None) -> str:
-    """A figure, and its goal if it has one."""
+    """Format a figure, with its goal if it has one."""
     if value is None:
         return ""
     text = f"{value:.0f}" if abs(value) >= 1000 else f"{value:.4g}"

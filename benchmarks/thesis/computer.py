@@ -71,7 +71,7 @@ def run(options: Options) -> Part:
 
 
 def modules(part: Part, name: str, row: dict[str, Any]) -> None:
-    """Share of a core, and percentiles of a turn, of every module, without slowness."""
+    """Record the share of a core, and percentiles of a turn, of every module, without slowness."""
     for module, turns in sorted(row["turns"].items()):
         prefix = f"{name}.{module.replace(' ', '_')}"
         part.add(f"{prefix}.cpu_percent", 100 * sum(turns) / row["seconds"])
@@ -80,7 +80,7 @@ def modules(part: Part, name: str, row: dict[str, Any]) -> None:
 
 
 def result_of(rows: list[dict[str, Any]], name: str, seconds: float, factor: float) -> dict[str, Any]:
-    """The run of a set-up at a factor, printed and added to its ``rows``."""
+    """Return the run of a set-up at a factor, printed and added to its ``rows``."""
     row = drive(TRACKERS[name], factor, seconds)
     print(f"  {name} x{factor:.3g}: control {row['control']:.3f}, mapping {row['mapping']:.3f}", flush=True)
     rows.append(row)
@@ -88,7 +88,7 @@ def result_of(rows: list[dict[str, Any]], name: str, seconds: float, factor: flo
 
 
 def drive(overlay: dict[str, Any], factor: float, seconds: float) -> dict[str, Any]:
-    """Shares of missed deadlines and the turns of every module while the truck drives."""
+    """Return the shares of missed deadlines and the turns of every module while the truck drives."""
     config = load_config(CONFIGS / "slam.yaml", SimulatedTruckConfig)[0]
     common = {"recorder": None, "blackbox": None, "map": None, "placement": {"slowness": factor}}
     config = with_overlay(config, {**common, "tracker": None})

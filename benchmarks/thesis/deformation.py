@@ -1,4 +1,4 @@
-"""5.4 Deformation: what the map does not contain stands on the route; ours, teb and the published planner.
+"""5.4 Deformation: unmapped obstacles on the route; ours, teb and the published planner.
 
 The closed loop of the navigation benchmark (kinematic truck, emulated lidar); every method drives every scenario.
 """

@@ -1,9 +1,9 @@
 """5.1 Kinematics: odometry's error and the turning radius for each manoeuvre, whole daemon, open-loop requests.
 
 The truck drives in the empty hall, on the virtual clock and through all emulated devices, with servos in whole degrees.
-Truth is the world's. The radius is that of the true poses while the angles hold, against the formula; the speed's ratio
-is the true way over odometry's. The formulas by themselves: how far wheels would slip at 1 m/s if they turned and
-rolled as the formulas say, and an axle angle that goes through the linkage and back.
+Truth is the world's. The radius is that of the true poses at constant angles, compared with the formula; the speed
+ratio is the true distance over odometry's. The formulas alone: the slip of wheels at 1 m/s if they turned and rolled
+according to the formulas, and an axle angle converted by the linkage and back.
 """
 
 import math
@@ -74,7 +74,7 @@ def run(options: Options) -> Part:
 
 
 def formulas(part: Part) -> None:
-    """What has no need of a drive."""
+    """Add the figures that need no drive."""
     front = np.linspace(-0.4, 0.4, 81)
     for mode, rear in (("2ws", 0.0 * front), ("counter", -front), ("crab", front)):
         vx, vy, wz = TRUCK.body_twist(1.0, front, rear)
@@ -91,7 +91,7 @@ def formulas(part: Part) -> None:
 
 
 def drive(legs: list[tuple[float, float, float]]) -> dict[str, Any]:
-    """True and estimated poses (n, 3) of the same instants, and the true radius of the first leg."""
+    """Return true and estimated poses (n, 3) of the same instants, and the true radius of the first leg."""
     config = load_config(CONFIGS / "demo.yaml", SimulatedTruckConfig)[0]
     overlay = {
         "path": None,

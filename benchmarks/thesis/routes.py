@@ -1,7 +1,7 @@
 """5.3 Path construction: random queries in the built-in rooms by all route planners, two and four wheels.
 
-``grid_astar`` is the author's (its paths bind no wheels); times are processor time. Clearance is that of the true
-footprint in the world, curvature is given as share of the tightest that the truck can drive.
+``grid_astar`` is the author's (its paths ignore the wheels' constraints); times are processor time. Clearance is that
+of the true footprint in the world; curvature is relative to the tightest that the truck can drive.
 """
 
 import time

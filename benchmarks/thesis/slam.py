@@ -1,7 +1,7 @@
 """5.2 Mapping: map and pose of a lap of the built-in loop against the world, whole daemon on the virtual clock.
 
-Compared: pose by scan matching and loop closures, and dead reckoning alone, over the same lap. The author's mappers
-(CRSM, gmapping) are no part of this repository.
+Compares the pose by scan matching and loop closures with dead reckoning alone, over the same lap. The author's mappers
+(CRSM, gmapping) are not part of this repository.
 """
 
 from typing import Any
@@ -49,7 +49,7 @@ def run(options: Options) -> Part:
 
 
 def lap(seconds: float) -> dict[str, Any]:
-    """Poses (n, 4; s first), the true ones of the same instants, and the last map; truth is on `mt/stand/`, too."""
+    """Return poses (n, 4; s first), the true ones of the same instants, and the last map."""
     config = load_config(CONFIGS / "slam.yaml", SimulatedTruckConfig)[0]
     config = with_overlay(
         config, {"recorder": None, "blackbox": None, "map": None, "stand": "simulator", "slam": {"map_period": 1.0}}

@@ -1,9 +1,9 @@
-"""5.5 Tracking: RMS and greatest distance from the path for each steering mode, our trackers and the published rules.
+"""5.5 Tracking: RMS and maximum distance from the path for each steering mode, our trackers and the published rules.
 
-The truck with dead time, lag and turning rate of its axles at the author's 0.2 m/s, from 5 cm beside the path. The end
-is that of the path (1e6: it was not found), the steering effort what both axles turned. In crab the truck keeps its
-heading, so it is asked for only on the course that never turns farther from it than the axles do; the heading's error
-is then the path's turning.
+The truck with dead time, lag and turning rate of its axles at the author's 0.2 m/s, from 5 cm beside the path. The
+final error is measured at the end of the path (1e6: not reached), the steering effort is the turn of both axles. In
+crab the truck keeps its heading, so it drives only the course whose direction stays within the axles' range; the
+heading error is then the turn of the path.
 """
 
 import numpy as np
@@ -46,12 +46,12 @@ def run(options: Options) -> Part:
 
 
 def modes(course: str) -> tuple[str, ...]:
-    """How the truck can follow a course."""
+    """Return the modes in which the truck can follow a course."""
     return MODES if course == SHIFTS else tuple(mode for mode in MODES if mode != "crab")
 
 
 def shifts() -> np.ndarray:
-    """Places of the course that a truck in crab can follow, shape (n, 2), m."""
+    """Return the places of the course that a truck in crab can follow, shape (n, 2), m."""
     x = np.arange(0.0, 8.0, 0.025)
     return np.column_stack((x, 0.18 * (1.0 - np.cos(np.pi * x / 2.0))))
 

@@ -1,1 +1,1 @@
-"""Parts of ``benchmarks/usb_kernel.py``: the virtual machine, and what runs inside it."""
+"""Parts of ``benchmarks/usb_kernel.py``: the virtual machine, and the programs inside it."""

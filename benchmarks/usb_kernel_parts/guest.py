@@ -1,4 +1,4 @@
-"""Runs inside the virtual machine: every situation on the kernel's own ttys, and what the event loop felt of it."""
+"""Runs inside the virtual machine: every situation on the kernel's own ttys, and its effect on the event loop."""
 
 import asyncio
 import os
@@ -10,7 +10,7 @@ from usb_kernel_parts.situations import run_all
 
 
 def main() -> int:
-    """Run everything; results go to the share as they come. Returns only if that fails."""
+    """Run everything; results are written to the share as they arise. Returns only on failure."""
     udev()
     joystick()
     subprocess.run(["udevadm", "settle"], check=True)
@@ -20,7 +20,7 @@ def main() -> int:
 
 
 async def run_and_leave() -> None:
-    """Run all, and end the process at once: the thread of a port that is still wedged would hold it for ever."""
+    """Run everything, and end the process at once: the thread of a wedged port would keep it alive for ever."""
     await run_all()
     save()
     sys.stdout.flush()

@@ -1,4 +1,4 @@
-"""Tools inside the virtual machine: requests to QEMU, what the event loop feels, results, udev, a joystick."""
+"""Tools inside the virtual machine: requests to QEMU, load of the event loop, results, udev, a joystick."""
 
 import asyncio
 import fcntl
@@ -37,12 +37,11 @@ RESULTS: dict[str, Any] = {}
 
 
 class Loop:
-    """How long the event loop's thread is inside the kernel by what drivers and libraries of ports call.
+    """Time that the event loop's thread spends in the kernel in calls of drivers and port libraries.
 
-    The machine computes some thirty times slower than a computer, so how long a callback computes says nothing; and
-    after a call the thread waits for the interpreter, which other threads hold. So the kernel itself traces when the
-    thread enters and leaves it, and whether it put it to sleep: other calls are long because this computer did
-    something else meanwhile.
+    The machine is some thirty times slower than a computer, so the duration of a callback means nothing; and after a
+    call the thread waits for the interpreter, which other threads hold. The kernel itself therefore traces when the
+    thread enters and leaves it, and whether it slept: other calls are long because this computer was busy.
     """
 
     _calls: ClassVar[list[tuple[float, float, str]]] = []
@@ -50,7 +49,7 @@ class Loop:
 
     @classmethod
     def measure(cls) -> None:
-        """From now on; call in the loop's thread."""
+        """Start measuring; must be called in the loop's thread."""
         for module, names in CALLS.items():
             for name in names:
                 setattr(module, name, cls._timed(getattr(module, name)))
@@ -80,7 +79,7 @@ class Loop:
 
     @classmethod
     def take(cls) -> dict[str, Any]:
-        """What was found since the last time."""
+        """Return the results since the last call."""
         (TRACE / "tracing_on").write_text("0")  # reading would be traced, without end
         text = (TRACE / "trace").read_text()
         (TRACE / "trace").write_text("")
@@ -111,7 +110,7 @@ _asked = 0
 
 
 async def ask(execute: str, **arguments: Any) -> Any:
-    """Let QEMU do something."""
+    """Send a request to QEMU."""
     global _asked
     number, _asked = _asked, _asked + 1
     scratch = SHARE / "ask" / f".{number}"
@@ -124,7 +123,7 @@ async def ask(execute: str, **arguments: Any) -> Any:
 
 
 async def until(condition: Callable[[], bool], seconds: float = 60.0) -> float:
-    """Wait; returns seconds."""
+    """Wait; return the seconds."""
     begin = time.monotonic()
     while not condition():
         if time.monotonic() - begin > seconds:
@@ -158,7 +157,7 @@ def udev() -> None:
 
 
 def joystick() -> None:
-    """A HID joystick on the second emulated controller, by configfs."""
+    """Create a HID joystick on the second emulated controller by configfs."""
     gadget = Path("/sys/kernel/config/usb_gadget/joystick")
     (gadget / "strings/0x409").mkdir(parents=True)
     (gadget / "idVendor").write_text("0x1d6b")

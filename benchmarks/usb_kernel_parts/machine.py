@@ -60,14 +60,14 @@ sync; poweroff -f
 
 
 class MissingError(Exception):
-    """A program or package that the machine needs is not here."""
+    """A program or package needed by the machine is missing."""
 
 
 def require() -> None:
-    """Look for the programs.
+    """Require the programs.
 
     Raises:
-        MissingError: some are missing; the text names the packages.
+        MissingError: some are missing; the text names their packages.
     """
     missing = [package for program, package in PROGRAMS.items() if shutil.which(program) is None]
     if missing:
@@ -75,7 +75,7 @@ def require() -> None:
 
 
 def kernel(folder: Path) -> Path:
-    """Download the newest Debian kernel and unpack it, once.
+    """Download the latest Debian kernel and unpack it, once.
 
     Returns:
         Folder with its ``boot`` and ``lib``.
@@ -102,7 +102,7 @@ def kernel(folder: Path) -> Path:
 
 
 def ordered_modules(unpacked: Path, wanted: tuple[str, ...]) -> list[Path]:
-    """Files of modules, each after those it depends on."""
+    """Return the files of modules, each after its dependencies."""
     files = {path.stem.replace("-", "_"): path for path in unpacked.glob("lib/modules/*/kernel/**/*.ko")}
     order: dict[str, Path] = {}
 
@@ -150,7 +150,7 @@ def initramfs(unpacked: Path, folder: Path, command: str) -> Path:
 class Machine:
     """A running machine.
 
-    What runs inside asks for changes by files: ``ask/N`` holds a request, ``answer/N`` what came of it.
+    The program inside requests changes by files: ``ask/N`` contains a request, ``answer/N`` the answer.
     """
 
     share: Path
@@ -158,10 +158,10 @@ class Machine:
     monitor: socket.socket
 
     def serve(self, seconds: float) -> int | None:
-        """Answer until the machine ends.
+        """Answer requests until the machine ends.
 
         Returns:
-            Exit code of what ran inside; None if it did not end in time.
+            Exit code of the program inside; None if it did not end in time.
         """
         end, number = monotonic() + seconds, 0
         asks, answers = self.share / "ask", self.share / "answer"
@@ -179,7 +179,7 @@ class Machine:
         return int(code.read_text()) if code.exists() else None
 
     def do(self, request: dict[str, Any]) -> Any:
-        """Let QEMU execute a request; returns what it answers."""
+        """Execute a request in QEMU; return its answer."""
         self.monitor.sendall(json.dumps(request).encode() + b"\n")
         buffer = b""
         while True:
@@ -191,7 +191,7 @@ class Machine:
 
 
 def adapter(name: str) -> list[str]:
-    """QEMU's arguments of one adapter."""
+    """Return QEMU's arguments for one adapter."""
     hub, port = ADAPTERS[name]
     place = f"{HUBS[hub]}.{port}"
     return ["-device", f"usb-serial,id={name},chardev=c-{name},port={place},always-plugged=on,serial=SN{name}"]
@@ -203,8 +203,8 @@ def booted(unpacked: Path, image: Path, folder: Path, lines: dict[str, Path]) ->
 
     Args:
         unpacked: folder of the kernel.
-        image: first file system.
-        folder: for sockets and what the machine writes.
+        image: initial file system.
+        folder: folder for sockets and the machine's output.
         lines: a Unix socket for the far end of each adapter's line.
     """
     share = folder / "share"

@@ -65,49 +65,49 @@ DEVICE_SIDE = Path("/dev/ttyGS0")
 
 
 def by_serial(serial: str) -> str:
-    """Place of the device with that serial number."""
+    """Return the place of the device with that serial number."""
     return next(name for name, device in read_tree(MACHINE.sysfs).devices.items() if device.serial == serial)
 
 
 def by_id(usb_id: str) -> str:
-    """Place of the device of that kind."""
+    """Return the place of the device of that kind."""
     return next(name for name, device in read_tree(MACHINE.sysfs).devices.items() if device.usb_id == usb_id)
 
 
 def place(name: str, **more: Any) -> UsbPortConfig:
-    """Settings of a port, by the kernel's name of what is there."""
+    """Return the settings of a port, by the kernel's name of its device."""
     return UsbPortConfig(hub=str(parent_of(name)), port=port_of(name), **more)
 
 
 def tty_of(name: str) -> Path | None:
-    """Node of what is there."""
+    """Return the node of a device."""
     device = read_tree(MACHINE.sysfs).devices.get(name)
     return Path("/dev", device.tty.name) if device is not None and device.tty is not None else None
 
 
 class Kept:
-    """Keeps what is published."""
+    """Publisher that keeps all messages."""
 
     def __init__(self) -> None:
         self.kept: list[Any] = []
 
     def put(self, message: Any) -> None:
-        """Keep."""
+        """Keep a message."""
         self.kept.append(message)
 
     def next_seq(self) -> int:
-        """Number of the next message."""
+        """Sequence number of the next message."""
         return len(self.kept)
 
 
 class Events:
-    """Keeps reasons."""
+    """Sink that keeps the reasons of events."""
 
     def __init__(self) -> None:
         self.reasons: list[Reason] = []
 
     def __call__(self, reason: Reason, *_: Any, **__: Any) -> None:
-        """Keep the reason."""
+        """Keep a reason."""
         self.reasons.append(reason)
 
 
@@ -152,10 +152,10 @@ class Robot:
 
 
 class DeviceSide:
-    """The device's side of the CDC-ACM port; opened again whenever the host was gone.
+    """Device side of the CDC-ACM port, reopened after every disconnection of the host.
 
     Args:
-        end: gets and gives the bytes.
+        end: serves the bytes.
     """
 
     def __init__(self, end: DeviceEnd) -> None:
@@ -164,7 +164,7 @@ class DeviceSide:
         end.connect(self._write)
 
     async def run(self) -> None:
-        """Until cancelled."""
+        """Run until cancelled."""
         loop = asyncio.get_running_loop()
         try:
             while True:
@@ -216,7 +216,7 @@ async def servo_controller() -> AsyncIterator[None]:
 
 
 async def tree() -> dict[str, Any]:
-    """Every device is there, with its node; the joystick too."""
+    """Check that every device has its node, including the joystick."""
     with contextlib.suppress(TimeoutError):
         await until(Path("/dev/input/js0").exists, 30)
     devices = read_tree(MACHINE.sysfs).devices
@@ -232,7 +232,7 @@ async def tree() -> dict[str, Any]:
 
 
 def control_lines(node: Path) -> tuple[bool, bool]:
-    """DTR and RTS as this process has them set; another open would raise both."""
+    """Return DTR and RTS as set by this process; another open would raise both."""
     for entry in Path("/proc/self/fd").iterdir():
         with contextlib.suppress(OSError):
             if str(entry.readlink()) == str(node):
@@ -242,12 +242,12 @@ def control_lines(node: Path) -> tuple[bool, bool]:
 
 
 async def switch(name: str, *, on: bool) -> None:
-    """Pull the cable at a place, as the kernel sees it, or plug it in."""
+    """Unplug or plug in the cable at a place, as seen by the kernel."""
     await asyncio.to_thread(MACHINE.sysfs.write, f"{port_directory(name)}/disable", "0" if on else "1")
 
 
 async def open_and_close() -> dict[str, Any]:
-    """Every adapter, ten times; the control lines as set."""
+    """Open and close every adapter ten times; check the control lines."""
     lines = {}
     for number in ("SNs1", "SNs2", "SNs3"):
         for nth in range(10):
@@ -261,7 +261,7 @@ async def open_and_close() -> dict[str, Any]:
 
 
 async def deaf() -> dict[str, Any]:
-    """A device that takes nothing: its link ends, its port is wedged, for the doctor too, until the kernel lets go."""
+    """A device that accepts no bytes: its link ends, and its port stays wedged until the kernel releases it."""
     node = tty_of(by_id(GADGET))
     assert node is not None
     port = SerialPort(node)
@@ -292,7 +292,7 @@ async def deaf() -> dict[str, Any]:
 
 
 async def listens_again() -> dict[str, Any]:
-    """A deaf device that listens again gets at most what was sent within the age limit."""
+    """A deaf device that accepts bytes again receives only bytes within the age limit."""
     node = tty_of(by_id(GADGET))
     assert node is not None
     link = await SerialPort(node).open()
@@ -340,7 +340,7 @@ async def drivers() -> dict[str, Any]:
 
 
 async def hub_pulled() -> dict[str, Any]:
-    """A hub with two adapters is pulled while the drive works, and comes back with other node numbers."""
+    """Pull a hub with two adapters while the drive works; it returns with other node numbers."""
     robot = Robot()
     async with servo_controller(), robot.running():
         await until(lambda: robot.ready("drive"), 60)
@@ -360,7 +360,7 @@ async def hub_pulled() -> dict[str, Any]:
 
 
 async def unplugged_in_mid_write() -> dict[str, Any]:
-    """An adapter vanishes under a writer; its port opens again at the same place."""
+    """Unplug an adapter during a write; its port opens again at the same place."""
     name = by_serial("SNs3")
     port = HubPort(place(name), MACHINE, Events())
     link = await port.open()
@@ -398,7 +398,7 @@ async def unplugged_in_mid_write() -> dict[str, Any]:
 
 
 async def replugged_while_wedged() -> dict[str, Any]:
-    """The deaf device is replugged while the kernel still closes its port: it opens again at once."""
+    """Replug a deaf device while the kernel still closes its port; it opens again at once."""
     node = tty_of(by_id(GADGET))
     assert node is not None
     link = await SerialPort(node).open()
@@ -423,7 +423,7 @@ async def replugged_while_wedged() -> dict[str, Any]:
 
 
 async def port_power() -> dict[str, Any]:
-    """A port is switched off and on by the kernel's attribute."""
+    """Switch a port off and on by the kernel's attribute."""
     name = by_serial("SNs3")
     number = read_tree(MACHINE.sysfs).devices[name].devnum
     power = PortPower(PowerConfig(method=CycleMethod.PORT, off_time=1.0), MACHINE, Events())
@@ -445,18 +445,18 @@ else:
 
 
 async def printed(*command: str) -> str:
-    """What a program prints."""
+    """Return the output of a program."""
     process = await asyncio.create_subprocess_exec(*command, stdout=asyncio.subprocess.PIPE)
     return (await process.communicate())[0].decode().strip()
 
 
 async def tried(node: Path) -> str:
-    """Number of the error with which another user's program opens a node; 0 if it may."""
+    """Return the error number when another user's program opens a node; 0 if it may."""
     return await printed(sys.executable, "-c", OPENER, str(node))
 
 
 async def foreign_opener() -> dict[str, Any]:
-    """A program that knows no lock and has no root rights, as a modem manager of a user, is refused."""
+    """A program without root rights that ignores locks, such as a modem manager, is refused."""
     node = tty_of(by_serial("SNs3"))
     assert node is not None
     Path(node).chmod(0o666)
@@ -473,7 +473,7 @@ async def foreign_opener() -> dict[str, Any]:
 
 
 def truck() -> TruckConfig:
-    """A configuration whose ports are those of the machine."""
+    """Return a configuration with the ports of the machine."""
     chosen = {"drive": by_serial("SNs1"), "compass": by_serial("SNs2"), "imu": by_serial("SNs3")}
     chosen |= {"steering": by_id(GADGET), "lidar": "1-7"}
     devices = ""
@@ -489,7 +489,7 @@ def truck() -> TruckConfig:
 
 
 async def udev_rules() -> dict[str, Any]:
-    """Rules of install-service: links by role, modem managers kept off, adapters quick."""
+    """Check the rules of install-service: links by role, modem managers kept off, low-latency adapters."""
     Path("/run/udev/rules.d/70-monstertruckd.rules").write_text(rules_text(truck()))
     for command in (["control", "--reload"], ["trigger", "--action=add"], ["settle"]):
         await asyncio.to_thread(subprocess.run, ["udevadm", *command], check=True)
@@ -507,7 +507,7 @@ SUBSYSTEM=="usb", KERNEL!="*:*", ENV{PRODUCT}=="403/6001/*", ENV{BRLTTY_BRAILLE_
 
 
 async def brltty() -> dict[str, Any]:
-    """A program takes an adapter as brltty does: driver and doctor say so; the rules keep brltty off."""
+    """A program claims an adapter as brltty does: driver and doctor report it; the rules keep brltty off."""
     name = by_serial("SNs3")
     device = read_tree(MACHINE.sysfs).devices[name]
     bus = int(name.partition("-")[0])
@@ -534,18 +534,18 @@ async def brltty() -> dict[str, Any]:
 
 
 def doctors_context() -> HostContext:
-    """What a check of the doctor gets."""
+    """Return the input of a check of the doctor."""
     truck()
     return inspect(ROOT, Program.present(), Path("/run/truck/truck.yaml"), 0, CLOCK)
 
 
 async def doctors_handshakes() -> dict[str, str]:
-    """Reasons that the doctor's handshakes end with."""
+    """Return the reasons of the doctor's handshakes."""
     return {one.check: one.reason.value async for one in handshakes(doctors_context())}
 
 
 async def topology() -> dict[str, Any]:
-    """Names by topology lead to the same places, whatever the numbers of the buses."""
+    """Names by topology lead to the same places, independently of the bus numbers."""
     names = {name: topology_of(MACHINE.sysfs, name) for name in read_tree(MACHINE.sysfs).devices if "-" in name}
     shown = await printed("udevadm", "info", f"/sys/bus/usb/devices/{by_serial('SNs1')}")
     ok = all(at_present(MACHINE.sysfs, long) == name for name, long in names.items())
@@ -553,7 +553,7 @@ async def topology() -> dict[str, Any]:
 
 
 async def renumbered_buses() -> dict[str, Any]:
-    """Controllers are found again in another order: a port by topology opens on a bus with another number."""
+    """Probe the controllers in another order: a port by topology opens on a bus with another number."""
     sysfs = MACHINE.sysfs
     before = by_serial("SNs1")
     topology = topology_of(sysfs, before)
@@ -575,7 +575,7 @@ async def renumbered_buses() -> dict[str, Any]:
 
 
 async def control() -> dict[str, Any]:
-    """A call of a library that sleeps for 50 ms on the loop: the measurement has to see it."""
+    """Sleep for 50 ms in a library call on the loop; the measurement must detect it."""
     master, slave = pty.openpty()
     with serial.Serial(os.ttyname(slave), timeout=0.05) as line:
         line.read(1)
@@ -585,7 +585,7 @@ async def control() -> dict[str, Any]:
 
 
 async def run_all() -> None:
-    """One after the other."""
+    """Run one situation after the other."""
     acts = (control, tree, topology, open_and_close, udev_rules, foreign_opener, brltty, drivers, hub_pulled)
     acts += (unplugged_in_mid_write, port_power, deaf, listens_again, replugged_while_wedged, renumbered_buses)
     for act in acts:

@@ -1,6 +1,6 @@
-"""The arena of the study's kind: walls with two acute and two obtuse corners and a gap, our estimate.
+"""The study's arena as we estimate it: walls with two acute and two obtuse corners and a gap.
 
-A rhombus: the path of the robot's middle, 0.35 m from the walls, is 48 m long. The gap of 0.4 m leads into a recess.
+A rhombus: the path of the robot's centre, 0.35 m from the walls, is 48 m long. The gap of 0.4 m leads into a recess.
 Walls are given in the order of a clockwise lap, so that the inside is on their right.
 """
 
@@ -34,23 +34,23 @@ class Arena(NamedTuple):
 
 
 def start_rule(first: int, second: int) -> tuple[float, str]:
-    """The study's start from the last digits of two numbers: heading, rad, and the side where the wall is.
+    """Return the study's start from the last digits of two numbers: heading (rad), and the side of the wall.
 
-    Heading is the sum modulo pi; an even sum is a clockwise lap, with the wall on the left.
+    The heading is the sum modulo pi; an even sum is a clockwise lap, with the wall on the left.
     """
     total = first + second
     return total % math.pi, "right" if total % 2 else "left"
 
 
 def study(acute: float = math.radians(70.0)) -> Arena:
-    """A parallelogram: two corners of ``acute``, two of its supplement (110 degrees)."""
+    """Return a parallelogram with two corners of ``acute``, and two of its supplement (110 degrees)."""
     shape = _parallelogram(1.0, acute)
     size = (PATH + _shrink(shape)) / _perimeter(shape)
     return _walled(shape * size)
 
 
 def drawn(seed: int) -> Arena:
-    """An arena of four or five walls with corners of 50 to 130 degrees, a door of 0.8 to 1 m, and a pillar."""
+    """Return an arena of four or five walls with corners of 50 to 130 degrees, a door of 0.8 to 1 m, and a pillar."""
     rng = np.random.default_rng([seed, 22])
     while True:
         count = int(rng.integers(4, 6))
@@ -75,7 +75,7 @@ def drawn(seed: int) -> Arena:
 
 
 def _furnished(corners: Array, rng: np.random.Generator) -> Arena:
-    """Walls with a door in one of them and a square pillar that leaves room along all walls and round the start."""
+    """Return walls with a door, and a square pillar that leaves room along all walls and around the start."""
     ends, door = np.roll(corners, -1, axis=0), int(rng.integers(len(corners)))
     walls = [(*a, *b) for i, (a, b) in enumerate(zip(corners, ends, strict=True)) if i != door]
     a, b = corners[door], ends[door]
@@ -100,7 +100,7 @@ def _furnished(corners: Array, rng: np.random.Generator) -> Arena:
 
 
 def _least(corners: Array, point: Array) -> float:
-    """Least distance of a point inside from the lines of the walls, m; negative outside."""
+    """Return the minimum distance of an inside point from the lines of the walls, m; negative outside."""
     along = np.roll(corners, -1, axis=0) - corners
     along /= np.linalg.norm(along, axis=1)[:, None]
     return float((along[:, 1] * (point - corners)[:, 0] - along[:, 0] * (point - corners)[:, 1]).min())
@@ -118,7 +118,7 @@ def _perimeter(corners: Array) -> float:
 
 
 def _shrink(corners: Array) -> float:
-    """By how much the offset path is shorter than the walls, m: 2 OFFSET / tan(half the inner angle) a corner."""
+    """Return the length of the walls minus that of the offset path, m: 2 OFFSET / tan(half the inner angle) per corner."""
     return sum(2 * OFFSET / math.tan(angle / 2) for angle in _angles(corners))
 
 
@@ -129,7 +129,7 @@ def _angles(corners: Array) -> tuple[float, ...]:
 
 
 def _walled(corners: Array) -> Arena:
-    """The gap is in the last wall, a third of its length before its end."""
+    """Return walls with the gap in the last wall, a third of its length before its end."""
     ends = np.roll(corners, -1, axis=0)
     walls = [(*a, *b) for a, b in zip(corners[:-1], ends[:-1], strict=True)]
     a, b = corners[-1], ends[-1]
@@ -144,7 +144,7 @@ def _walled(corners: Array) -> Arena:
 
 @njit(cache=True)
 def rays(walls: Array, xs: Array, ys: Array, angles: Array, reach: float) -> Array:
-    """Ranges along rays to the nearest wall, m; inf beyond ``reach``; a ``Caster`` once its walls are bound."""
+    """Return ranges along rays to the nearest wall, m; inf beyond ``reach``; a ``Caster`` once its walls are bound."""
     ranges = np.full(len(angles), np.inf)
     for i in range(len(angles)):
         dx, dy = math.cos(angles[i]), math.sin(angles[i])
@@ -164,7 +164,7 @@ def rays(walls: Array, xs: Array, ys: Array, angles: Array, reach: float) -> Arr
 
 @njit(cache=True)
 def blocked(walls: Array, x: float, y: float, yaw: float, length: float = 0.32, width: float = 0.30) -> bool:
-    """Whether any wall reaches into the footprint at a pose (Liang and Barsky's clipping)."""
+    """Whether any wall overlaps the footprint at a pose (Liang-Barsky clipping)."""
     c, s = math.cos(yaw), math.sin(yaw)
     for wall in walls:
         ax, ay = c * (wall[0] - x) + s * (wall[1] - y), c * (wall[1] - y) - s * (wall[0] - x)

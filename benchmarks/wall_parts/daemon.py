@@ -52,7 +52,7 @@ class DaemonLap(NamedTuple):
 
 
 def map_of(walls: Array, folder: Path) -> Path:
-    """A map file of walls, 4 cm thick on the side away from the middle."""
+    """Write a map file of walls, 4 cm thick on the outside."""
     reach = float(np.abs(walls).max()) + 0.5
     size = math.ceil(2 * reach / CELL)
     cells = np.full((size, size), FREE, dtype=np.int8)
@@ -80,13 +80,13 @@ def robot(folder: Path, walls: Array, start: tuple[float, float, float], seed: i
 
 
 def lap(behaviour: str, side: str, seed: int, model: str) -> DaemonLap:
-    """One lap of the study's arena from its middle.
+    """Drive one lap of the study's arena from its centre.
 
     Args:
-        behaviour: of sonar.yaml, without the side: ``line``, ``wall``, ``published``, ``switching``.
-        side: of the wall.
-        seed: of heading and noise.
-        model: of the sonars.
+        behaviour: behaviour of sonar.yaml, without the side: ``line``, ``wall``, ``published``, ``switching``.
+        side: side of the wall.
+        seed: seed of heading and noise.
+        model: model of the sonars.
     """
     arena, rng = study(), np.random.default_rng(seed)
     walls = arena.walls if side == "left" else mirrored(arena.walls)[:, [2, 3, 0, 1]]
@@ -105,7 +105,7 @@ def lap(behaviour: str, side: str, seed: int, model: str) -> DaemonLap:
 
 
 def _track(truth: Array, states: list[BehaviourState], side: str) -> Array:
-    """The truth as ``WallRun.track`` has it."""
+    """Return the truth in the format of ``WallRun.track``."""
     mirror = 1.0 if side == "left" else -1.0
     stamps = np.array([state.stamp / SECOND for state in states])
     found = np.array([state.phase not in ("", "settle", "search", "approach") for state in states])
@@ -115,7 +115,7 @@ def _track(truth: Array, states: list[BehaviourState], side: str) -> Array:
 
 
 def beside(arena: Arena, way: float = 2.0) -> tuple[float, float, float]:
-    """Pose of a robot along the first wall, ``way`` m from its beginning, at the distance wanted."""
+    """Return the pose of a robot along the first wall, ``way`` m from its start, at the set distance."""
     a, b = arena.corners[:2]
     along = (b - a) / np.linalg.norm(b - a)
     x, y = a + way * along + 0.35 * np.array([along[1], -along[0]])
@@ -125,7 +125,7 @@ def beside(arena: Arena, way: float = 2.0) -> tuple[float, float, float]:
 def tuned(
     seed: int, first: float, model: str, report: Callable[[TuningRun], None] = lambda _: None
 ) -> tuple[WallGains | None, list[TuningRun]]:
-    """What ``monstertruckd tune wall`` does, to its end, on the virtual clock.
+    """Run ``monstertruckd tune wall`` to its end on the virtual clock.
 
     Raises:
         TruckError: it ended early.
@@ -151,7 +151,7 @@ def tuned(
 
 
 class FaultRun(NamedTuple):
-    """One robot that follows walls while its devices break, one after another."""
+    """One robot that follows walls during successive device faults."""
 
     contact: bool
     metres: float
@@ -161,7 +161,7 @@ class FaultRun(NamedTuple):
 
 
 def broken(side: str, seed: int, seconds: float) -> FaultRun:
-    """Random faults of the robot's catalog, one about every 10 s; the behaviour is started again when it ended."""
+    """Cause random faults of the robot's catalog, one about every 10 s; restart the behaviour whenever it ends."""
     arena, ends = study(), Counter[str]()
     walls = arena.walls if side == "left" else mirrored(arena.walls)[:, [2, 3, 0, 1]]
     x, y, yaw = beside(arena)

@@ -1,6 +1,6 @@
-"""A robot with five sonars, odometry and a gyroscope that a behaviour drives along walls: no daemon, no gate.
+"""A robot with five sonars, odometry and a gyroscope, driven along walls by a behaviour: no daemon, no gate.
 
-It follows the twist asked for within the acceleration of its gate and a lag of 50 ms. Sonars measure ten times a
+It follows the requested twist within the acceleration of its gate and a lag of 50 ms. Sonars measure ten times a
 second, the behaviour runs at its own rate. After the behaviour's end, and when a topic it reads is stale, it brakes.
 """
 
@@ -48,7 +48,7 @@ FaultKind = Literal["dead", "stuck", "cross-talk", "imu", "motor"]
 
 @dataclass(frozen=True)
 class Fault:
-    """What breaks, and when, s."""
+    """A fault and its time, s."""
 
     kind: FaultKind
     at: float
@@ -76,7 +76,7 @@ class WallRun(NamedTuple):
     """Processor time of every step of the behaviour, without the simulation, s."""
 
     def jumps(self) -> tuple[int, int, float, float]:
-        """How often speed and yaw rate asked for jump from one step to the next, and their greatest changes."""
+        """Return how often requested speed and yaw rate jump from one step to the next, and their largest changes."""
         changes = np.abs(np.diff(self.asked, axis=0)) if len(self.asked) > 1 else np.zeros((1, 2))
         counts = (changes > JUMP * self.period + 1e-9).sum(axis=0)
         return int(counts[0]), int(counts[1]), float(changes[:, 0].max()), float(changes[:, 1].max())
@@ -84,7 +84,7 @@ class WallRun(NamedTuple):
 
 @dataclass
 class Body:
-    """Where the robot is, how it moves, and where it believes to be."""
+    """True pose, motion, and estimated pose of the robot."""
 
     pose: tuple[float, float, float]
     scale: float
@@ -95,7 +95,7 @@ class Body:
     stalled: str = ""
 
     def move(self, v: float, w: float, braking: float = ACCELERATION) -> None:
-        """A fine step towards a twist."""
+        """Execute a fine step towards a twist."""
         w = min(max(w, -YAW_RATE), YAW_RATE)
         self.v += float(np.clip((v - self.v) * FINE / LAG, -braking * FINE, braking * FINE))
         self.w += float(np.clip((w - self.w) * FINE / LAG, -YAW_ACCELERATION * FINE, YAW_ACCELERATION * FINE))
@@ -108,25 +108,25 @@ class Body:
 
     @property
     def driven(self) -> tuple[float, float]:
-        """Speed and yaw rate, with the wheel that stalls."""
+        """Return speed and yaw rate with a stalled wheel."""
         left, right = self.v - self.w * HALF_TRACK, self.v + self.w * HALF_TRACK
         left, right = (0.0 if self.stalled == "left" else left), (0.0 if self.stalled == "right" else right)
         return (left + right) / 2, (right - left) / (2 * HALF_TRACK)
 
     @property
     def wheel(self) -> float:
-        """Speed of the faster wheel, m/s."""
+        """Return the speed of the faster wheel, m/s."""
         return abs(self.v) + abs(self.w) * HALF_TRACK
 
 
 class Ears:
-    """The sonars' messages.
+    """Messages of the sonars.
 
     Args:
-        cast: the walls.
-        model: of the sonars.
-        rng: of their noise.
-        fault: of one of them.
+        cast: ray caster of the walls.
+        model: model of the sonars.
+        rng: random numbers of their noise.
+        fault: fault of one of them.
     """
 
     def __init__(self, cast: Any, model: SonarModelConfig, rng: np.random.Generator, fault: Fault | None) -> None:
@@ -134,7 +134,7 @@ class Ears:
         self._last: dict[str, float] = {}
 
     def hear(self, pose: tuple[float, float, float], t: float, now: int) -> SonarRanges:
-        """One round."""
+        """Return one round of measurements."""
         heard, dead, fault = dict(survey(self._cast, pose, self._model, self._rng)), "", self._fault
         if fault is not None and t >= fault.at:
             if fault.kind == "dead":
@@ -173,7 +173,7 @@ def mounts() -> Transforms:
 
 
 def mirrored(walls: Array) -> Array:
-    """For a wall on the right."""
+    """Return the mirrored walls, for a wall on the right."""
     return walls * np.array([1.0, -1.0, 1.0, -1.0])
 
 
@@ -189,17 +189,17 @@ def drive_along(
     fault: Fault | None = None,
     watch: Callable[[float, Body, Any], None] | None = None,
 ) -> WallRun:
-    """Drive until the behaviour ends, touches a wall, or the time is over.
+    """Drive until the behaviour ends, the robot touches a wall, or the time is over.
 
     Args:
         pilot: the behaviour.
-        rate: its steps a second.
+        rate: its steps per second.
         arena: walls of a clockwise lap.
-        side: where the wall is.
-        seed: of start, noise, and errors of the odometry.
-        model: of the sonars.
-        start: pose; None = near the middle, any heading.
-        fault: that occurs.
+        side: side of the wall.
+        seed: seed of start, noise, and odometry errors.
+        model: model of the sonars.
+        start: start pose; None: near the centre, with a random heading.
+        fault: fault during the run.
         watch: called every step.
     """
     rng = np.random.default_rng(seed)

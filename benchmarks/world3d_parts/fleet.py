@@ -1,4 +1,4 @@
-"""Two robots and people who walk in one world of rigid bodies, a daemon for each robot: one leads, one follows."""
+"""Two robots and walking people in one world of rigid bodies, a daemon for each robot: one leads, one follows."""
 
 import hashlib
 from time import process_time
@@ -35,7 +35,7 @@ async def _start(rig: VirtualRig, clock: VirtualClock, behaviour: str, **setting
 
 
 def _drive(people: tuple[Any, ...]) -> tuple[list[np.ndarray], list[Any], Reason, float]:
-    """Truth of both robots, contacts, how the follower ended, and seconds of processor time."""
+    """Return the truth of both robots, contacts, the end of the follower, and processor time (s)."""
 
     async def main(clock: VirtualClock) -> tuple[list[np.ndarray], list[Any], Reason]:
         names = ("leader", "second")
@@ -57,7 +57,7 @@ def _drive(people: tuple[Any, ...]) -> tuple[list[np.ndarray], list[Any], Reason
 
 
 def fleet() -> dict[str, float]:
-    """Alone, and with people; the second twice, for it has to be the same."""
+    """Run alone, and twice with people, which must give the same."""
     _, alone, outcome, _ = _drive(())
     runs = [_drive(PEOPLE) for _ in range(2)]
     truths, contacts, _, seconds = runs[0]

@@ -1,7 +1,7 @@
-"""A patch of rubble on the way between two places: whether it is found, and whether routes go round it.
+"""A patch of rubble between two places: must be found, and avoided by routes.
 
-The whole chain: stones tilt the body, the compass feels it, ``state/ground`` holds it, the route planner avoids it, the
-truck drives. Ground beside the wheels is unknown and costs nothing, so each trip over the patch finds one strip of it.
+The whole chain: stones tilt the body, the compass measures it, ``state/ground`` stores it, the route planner avoids it,
+the truck drives. Ground beside the wheels is unknown and costs nothing, so each trip over the patch finds one strip.
 """
 
 from math import pi
@@ -40,7 +40,7 @@ ROUGH = 0.004
 
 
 class Trip(NamedTuple):
-    """One way between the ends."""
+    """One trip between the ends."""
 
     reached: bool
     way: Array
@@ -48,18 +48,18 @@ class Trip(NamedTuple):
 
     @property
     def length(self) -> float:
-        """Metres driven."""
+        """Distance travelled, m."""
         return float(np.hypot(*np.diff(self.way, axis=0).T).sum())
 
     def on(self, width: float) -> float:
-        """Metres of it with a wheel over a patch of this width."""
+        """Return the distance with a wheel over a patch of this width, m."""
         x, y = self.way[1:].T
         over = (x > PATCH[0]) & (x < PATCH[1]) & (abs(y) < width / 2 + HALF)
         return float(np.hypot(*np.diff(self.way, axis=0).T)[over].sum())
 
 
 def config(width: float) -> SimulatedTruckConfig:
-    """A truck with goals on the map of a hall with stones."""
+    """Return a truck with goals on the map of a hall with stones."""
     base = load_config(CONFIGS / "world3d" / "rubble.yaml", SimulatedTruckConfig)[0]
     stones = {
         "kind": "rubble",
@@ -83,7 +83,7 @@ def config(width: float) -> SimulatedTruckConfig:
 
 
 def trips(width: float, count: int) -> tuple[list[Trip], Ground | None]:
-    """Ways to and fro over a patch, and what is known of the ground after the last."""
+    """Return trips to and fro over a patch, and the known ground after the last."""
 
     async def drive(truck: DrillTruck) -> tuple[list[Trip], Ground | None]:
         ground = truck.rig.bus.subscribe(topics.GROUND, latest())
@@ -120,7 +120,7 @@ async def _trip(truck: DrillTruck, number: int, goal: Pose2D) -> Trip:
 
 
 def found(ground: Ground, width: float, ways: list[Trip]) -> tuple[float, float]:
-    """Shares of the cells under the truck's middle that are rough: on the patch, and away from it."""
+    """Return the rough shares of the cells under the truck's centre: on the patch, and away from it."""
     cells = np.asarray(ground.roughness).reshape(ground.height, ground.width)
     way = np.vstack([trip.way for trip in ways])
     columns, rows = np.floor((way - (ground.origin.x, ground.origin.y)) / ground.resolution).astype(int).T
@@ -135,7 +135,7 @@ def found(ground: Ground, width: float, ways: list[Trip]) -> tuple[float, float]
 
 
 def patch() -> dict[str, float]:
-    """Trips over a narrow patch and over one from wall to wall."""
+    """Drive over a narrow patch and over one from wall to wall."""
     figures: dict[str, float] = {}
     for name, width in WIDTHS.items():
         ways, ground = trips(width, TRIPS)

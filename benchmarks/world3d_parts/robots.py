@@ -1,4 +1,4 @@
-"""Every body that stands on rigid wheels drives its bend, and the robot with five sonars follows a wall by them."""
+"""Every body with rigid wheels drives its bend, and the robot with five sonars follows a wall."""
 
 from math import dist
 from pathlib import Path
@@ -25,13 +25,13 @@ WALL, ASIDE, DISTANCE = 3.5, 0.05, 0.30
 
 
 def config(name: str, **world: Any) -> SimulatedTruckConfig:
-    """A robot of the folder in three dimensions."""
+    """Return a robot of the folder in three dimensions."""
     base = load_config(ROBOTS / f"{name}.yaml", SimulatedTruckConfig)[0]
     return with_overlay(base, {"recorder": None, "sim": {"world": {"engine": "mujoco", **world}}})
 
 
 def bend(name: str) -> tuple[Lap, np.ndarray]:
-    """The lap of one robot, and where it truly was."""
+    """Return the lap of one robot, and its true poses."""
 
     async def main(clock: VirtualClock) -> tuple[Lap, np.ndarray]:
         rig = VirtualRig(config(name), clock)
@@ -44,7 +44,7 @@ def bend(name: str) -> tuple[Lap, np.ndarray]:
 
 
 def wall(seconds: float = 9.0) -> tuple[np.ndarray, bool]:
-    """Where the robot with sonars was, and whether it followed to the end."""
+    """Return the poses of the robot with sonars, and whether it followed the wall to the end."""
 
     async def main(clock: VirtualClock) -> tuple[np.ndarray, bool]:
         start = {"x": -1.0, "y": WALL - 0.35, "yaw": 0.0}
@@ -65,7 +65,7 @@ def wall(seconds: float = 9.0) -> tuple[np.ndarray, bool]:
 
 
 def robots() -> dict[str, float]:
-    """How many reach the end of the bend without a touch, how exactly, and how far from the wall the other one is."""
+    """Return how many robots complete the bend without contact, their errors, and the wall follower's distance."""
     figures: dict[str, float] = {}
     reached, worst = 0, 0.0
     for name in BODIES:

@@ -45,7 +45,7 @@ RPM = 644 / (2 * pi * 0.075) * 60
 
 
 class Driven(NamedTuple):
-    """What one drive over ground came to; degrees and metres."""
+    """Result of one drive over ground; degrees and metres."""
 
     lidar: np.ndarray
     """Tilt of the scan plane at every 20 ms."""
@@ -61,12 +61,12 @@ class Driven(NamedTuple):
 
     @property
     def errors(self) -> np.ndarray:
-        """Errors of the pose, without alignment."""
+        """Return the errors of the pose, without alignment."""
         return np.hypot(*(self.poses - self.true)[:, :2].T)
 
 
 def run(config: SimulatedTruckConfig, drive: Callable[[DrillTruck], Awaitable[Any]]) -> Any:
-    """What ``drive`` returns, on the virtual clock."""
+    """Return the result of ``drive`` on the virtual clock."""
     found: list[Any] = []
 
     async def main(clock: VirtualClock) -> None:
@@ -78,7 +78,7 @@ def run(config: SimulatedTruckConfig, drive: Callable[[DrillTruck], Awaitable[An
 
 
 def hills() -> list[dict[str, Any]]:
-    """Hills with the RMS slope over the demo's world, and a ramp."""
+    """Return hills with the RMS slope over the demo's world, and a ramp."""
     feature = {"kind": "hills", "height": 0.05, "wavelength": WAVE, "seed": 5}
     config = WorldConfig.model_validate({"engine": "mujoco", "map": "loop", "ground": [feature]})
     heights = ground_heights(config, None, (-3.0, 3.0, -3.0, 3.0), [(9.0, 9.0, 0.0)])
@@ -90,7 +90,7 @@ def hills() -> list[dict[str, Any]]:
 
 
 def laps(metres: float, folder: Path) -> Path:
-    """A path file there of as many laps of the demo as are that long."""
+    """Write a path file of as many laps of the demo as have that length; return its path."""
     header, *points = (CONFIGS / "paths" / "loop.csv").read_text().splitlines()
     places = np.array([point.split(",")[:2] for point in points], dtype=float)
     lap = float(np.hypot(*np.diff(places, axis=0).T).sum())
@@ -100,7 +100,7 @@ def laps(metres: float, folder: Path) -> Path:
 
 
 def over(ground: list[dict[str, Any]], metres: float, *, stabilised: bool) -> Driven:
-    """Laps of the demo with a map that grows; shorter where the truck comes to a stand."""
+    """Drive laps of the demo with a growing map; shorter if the truck stops."""
     with TemporaryDirectory() as folder:
         return _over(ground, metres, laps(metres, Path(folder)), stabilised=stabilised)
 
@@ -159,7 +159,7 @@ def _over(ground: list[dict[str, Any]], metres: float, path: Path, *, stabilised
 
 
 def aligned_ate(poses: np.ndarray, true: np.ndarray) -> float:
-    """RMS distance once the whole way is turned and moved onto the true one, by least squares (Umeyama 1991); m."""
+    """Return the RMS distance after the least-squares alignment to the true path (Umeyama 1991); m."""
     a, b = poses[:, :2] - poses[:, :2].mean(0), true[:, :2] - true[:, :2].mean(0)
     turn = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
     c, s = np.cos(turn), np.sin(turn)
@@ -167,7 +167,7 @@ def aligned_ate(poses: np.ndarray, true: np.ndarray) -> float:
 
 
 def to_walls(grid: Grid, world: World) -> np.ndarray:
-    """Distance of every occupied cell of a map from the nearest solid cell of the world, m."""
+    """Return the distance of every occupied cell of a map from the nearest solid cell of the world, m."""
     base = world.map
     far = distance_transform_edt(base.cells != OCCUPIED) * base.resolution
     cells = np.asarray(grid.cells).reshape(grid.height, grid.width)
@@ -180,7 +180,7 @@ def to_walls(grid: Grid, world: World) -> np.ndarray:
 
 
 def kept(keep: Path | None, name: str, metres: float, drive: Callable[[], Driven]) -> Driven:
-    """A drive, or what is in the folder of one that was finished before."""
+    """Return a drive, or its finished result in the folder."""
     file = None if keep is None else keep / f"{name}-{metres:g}.npz"
     if file is None:
         return drive()
@@ -192,9 +192,9 @@ def kept(keep: Path | None, name: str, metres: float, drive: Callable[[], Driven
 
 
 def rough(metres: float, keep: Path | None = None) -> dict[str, float]:
-    """Lidar, map and pose on hills; on the flat for comparison, and without stabiliser.
+    """Measure lidar, map and pose on hills; on the flat for comparison, and without stabiliser.
 
-    With a folder to ``keep`` them in, drives that are finished are not driven again.
+    With a folder ``keep``, finished drives are not repeated.
     """
     figures: dict[str, float] = {}
     grounds = {"flat": ([], True), "rough": (hills(), True), "unstabilised": (hills(), False)}
@@ -224,7 +224,7 @@ def rough(metres: float, keep: Path | None = None) -> dict[str, float]:
 
 
 def hillside(seed: int) -> dict[str, Any]:
-    """The hall with a hillside that the truck drives onto aslant; angles by the seed."""
+    """Return the hall with a hillside that the truck climbs at an angle; angles by the seed."""
     rng = np.random.default_rng(seed)
     angle, aslant = float(rng.uniform(37.0, 40.0)), float(rng.uniform(0.3, 0.5))
     side = float(rng.choice([-1.0, 1.0]))
@@ -241,7 +241,7 @@ def hillside(seed: int) -> dict[str, Any]:
 
 
 def slopes(seeds: int) -> dict[str, float]:
-    """How many of some trucks that drive onto a hillside fall over, by the daemon and without one."""
+    """Return how many trucks that drive onto a hillside fall over, with the daemon and without one."""
     fallen, bare, steepest = 0, 0, 0.0
     base = load_config(CONFIGS / "world3d" / "side_slope.yaml", SimulatedTruckConfig)[0]
     for seed in range(1, seeds + 1):
@@ -263,9 +263,9 @@ def slopes(seeds: int) -> dict[str, float]:
 
 
 def drilled(count: int, keep: Path | None = None) -> dict[str, float]:
-    """Seeded faults on the whole truck, with its deadman line; metres without computer, with the line and without.
+    """Cause seeded faults on the whole truck; return metres without computer, with and without the deadman line.
 
-    With a folder to ``keep`` them in, a second run goes on behind the legs that the first one finished.
+    With a folder ``keep``, a second run continues after the finished legs of the first.
     """
     truck = load_config(CONFIGS / "full3d.yaml", SimulatedTruckConfig)[0]
     report = Drill(1, count, truck).run(jobs=default_jobs(), resume=None if keep is None else keep / "drill.jsonl")
@@ -278,7 +278,7 @@ def drilled(count: int, keep: Path | None = None) -> dict[str, float]:
 
 
 async def _unpowered(truck: DrillTruck) -> float:
-    """Metres that a truck drives in ten seconds from when its computer's supply (M4-ATX) fails."""
+    """Return the distance (m) driven in ten seconds after its computer's supply (M4-ATX) fails."""
     assert await truck.until(truck.drives, 15.0, Order.ARM)
     rig, clock = truck.rig, truck.clock
     await clock.sleep(2.0)

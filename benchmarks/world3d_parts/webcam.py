@@ -1,4 +1,4 @@
-"""The whole daemon with its rendered webcam, 640 x 480 at 15 Hz: how fast, against the clock on the wall."""
+"""The whole daemon with its rendered webcam, 640 x 480 at 15 Hz: speed relative to real time."""
 
 import time
 
@@ -24,7 +24,7 @@ OVERLAY = {
 
 
 def webcam(seconds: float = 10.0) -> dict[str, float]:
-    """Seconds of the world's clock in one of the wall's, and pictures a second of the former."""
+    """Return seconds of the world's clock per second of real time, and images per second of the former."""
 
     async def drive(truck: DrillTruck) -> tuple[float, int]:
         assert await truck.until(truck.drives, 15.0, Order.ARM)
