@@ -20,7 +20,7 @@ def rms(values: Array) -> float:
 
 
 def at(stamps: Array, poses: Array, instants: Array) -> Array:
-    """Return poses (m, 3) at instants (s), linearly interpolated in a trajectory (n, 3) with the yaw unwrapped."""
+    """Return poses (m, 3) at instants (s), linear between those of a trajectory (n, 3), with the yaw unwrapped."""
     yaw = np.unwrap(poses[:, 2])
     return np.column_stack([np.interp(instants, stamps, column) for column in (poses[:, 0], poses[:, 1], yaw)])
 
@@ -39,7 +39,7 @@ def trajectory(estimate: Array, truth: Array) -> dict[str, float]:
 
 
 def relative(stamps: Array, estimate: Array, truth: Array, seconds: float) -> float:
-    """Return the RMS error of the motion over a duration, m (relative pose error), of every pose (n, 3) with a later one.
+    """Return the RMS error of the motion over a duration, m (relative pose error), of each pose (n, 3) with a later one.
 
     Args:
         stamps: increasing, s.

@@ -1,1 +1,1 @@
-"""Chapter 5 of the thesis: a module with ``run(options) -> Part`` for each experiment; ``python -m benchmarks.thesis``."""
+"""Chapter 5 of the thesis: a module with ``run(options) -> Part`` for each experiment; run ``benchmarks.thesis``."""

@@ -118,7 +118,7 @@ def _perimeter(corners: Array) -> float:
 
 
 def _shrink(corners: Array) -> float:
-    """Return the length of the walls minus that of the offset path, m: 2 OFFSET / tan(half the inner angle) per corner."""
+    """Return the walls' length minus the offset path's, m: 2 OFFSET / tan(half the inner angle) per corner."""
     return sum(2 * OFFSET / math.tan(angle / 2) for angle in _angles(corners))
 
 
