@@ -39,7 +39,7 @@ def trajectory(estimate: Array, truth: Array) -> dict[str, float]:
 
 
 def relative(stamps: Array, estimate: Array, truth: Array, seconds: float) -> float:
-    """Return the RMS error of the motion over a duration, m (relative pose error), of each pose (n, 3) with a later one.
+    """Return the RMS error of the motion over a duration, m (RPE), of each pose (n, 3) with a later one.
 
     Args:
         stamps: increasing, s.
