@@ -1,4 +1,4 @@
-"""Repetition of a recorded run: its sensor data through estimation again, the outputs compared."""
+"""Replay of a recorded run: estimation from its sensor data is recomputed, and the outputs are compared."""
 
 from monstertruckd.tools.replay_check.check import check_log
 from monstertruckd.tools.replay_check.recorded import parts_of, run_of

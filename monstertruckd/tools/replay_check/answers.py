@@ -1,6 +1,6 @@
-"""Answers of planner and local planner in a replay: computed again, delivered when the log shows the recorded ones.
+"""Answers of planner and local planner in a replay: recomputed, and delivered when the log shows the recorded ones.
 
-The truck drove the recorded path, so the goal service gets the recorded one, and later outputs can be compared. The
+The truck drove the recorded path, so the goal service receives the recorded one, and later outputs can be compared. The
 computed path is kept and compared with it.
 """
 
@@ -24,13 +24,13 @@ from monstertruckd.tools.replay_check.pace import PacedClock
 
 
 class ComputedPaths:
-    """Computed result where another path was driven."""
+    """Computed paths that differ from those driven."""
 
     def __init__(self) -> None:
         self._computed: dict[str, PosePath | None] = {}
 
     def settle(self, computed: PosePath | None, driven: Path) -> PosePath:
-        """The path for the goal service: the one that was driven."""
+        """Return the path for the goal service: the one that was driven."""
         if computed is not None and _same(computed, driven):
             return computed
         self._computed[driven.name] = computed
@@ -38,7 +38,7 @@ class ComputedPaths:
         return replace(path, steering=path.steering or _steering(computed, path.poses))
 
     def as_computed(self, path: Path) -> Path:
-        """``path`` as it would be if no other path had been driven."""
+        """Return ``path`` as it would be if no other path had been driven."""
         if path.name not in self._computed:
             return path
         computed = self._computed[path.name]
@@ -49,7 +49,7 @@ class ComputedPaths:
 
 
 class _Replayed:
-    """Takes steps in the loop; a log gives the delivery times of their results."""
+    """Executes steps in the loop; a log gives the delivery times of their results."""
 
     def __init__(self, target: str, clock: PacedClock, record: GoalRecord, book: ComputedPaths, latency: float) -> None:
         self._inner = LoopActor(target, WallClock(), 0.0)  # not virtual: it answers at once
@@ -57,7 +57,7 @@ class _Replayed:
         self._latency = round(latency * SECOND)
 
     async def start(self) -> None:
-        """Make ready for the first step."""
+        """Prepare for the first step."""
         await self._inner.start()
 
     async def __aenter__(self) -> Self:
@@ -68,10 +68,10 @@ class _Replayed:
 
 
 class ReplayedPlanner(_Replayed):
-    """Routes and ways out."""
+    """Recomputes routes and ways out."""
 
     async def step(self, task: PlanTask) -> RouteAnswer:
-        """Answer just before the tick that shows the recorded answer; never, if the log ends before."""
+        """Answer just before the tick that shows the recorded answer; never if the log ends before."""
         end = self._record.decided()
         answer: RouteAnswer = await self._inner.step(task)
         if end is None:
@@ -86,10 +86,10 @@ class ReplayedPlanner(_Replayed):
 
 
 class ReplayedDeformer(_Replayed):
-    """Delivery of a route; mostly unrecorded, and due after the configured latency."""
+    """Recomputes deformed routes; most results are unrecorded, and due after the configured latency."""
 
     async def step(self, task: DeformTask) -> DeformAnswer:
-        """Answer when a path shows the recorded answer, else in time."""
+        """Answer when a path shows the recorded answer, otherwise when due."""
         begin = self._clock.now()
         answer: DeformAnswer = await self._inner.step(task)
         shown = self._record.path_between(begin, begin + 2 * self._latency, DEFORMED)
@@ -107,7 +107,7 @@ class ReplayedActors(ActorFactory):
         self._paced, self._record, self._book = clock, record, book
 
     def actor(self, placement: Placement, name: str, target: str, *, latency: float, **limits: Any) -> Actor:
-        """Run in the loop, wherever it ran before."""
+        """Return an actor in the loop, wherever it ran in the recorded run."""
         how = target, self._paced, self._record, self._book, latency
         match name:
             case "planning":
@@ -119,7 +119,7 @@ class ReplayedActors(ActorFactory):
 
 
 def _steering(computed: PosePath | None, poses: Array) -> tuple[Steering, ...]:
-    """Ways of steering, which paths in logs do not name: those where the computed path comes nearest."""
+    """Return the steering modes, which paths in logs omit, from the nearest parts of the computed path."""
     if computed is None or not computed.steering:
         return ()
     apart = poses[:, None, :2] - computed.poses[None, :, :2]

@@ -1,4 +1,4 @@
-"""The services of a robot that compute from sensors, put together again without its devices."""
+"""The services of a robot that compute from sensors, assembled without its devices."""
 
 import asyncio
 from bisect import bisect_left
@@ -67,11 +67,11 @@ and goals have their turns at the same instants, in either order."""
 
 
 def replayable(config: TruckConfig) -> TruckConfig:
-    """The part of a configuration that is computed again: nothing is saved, drawn or sent elsewhere.
+    """Return the part of a configuration that is recomputed: nothing is saved, drawn or sent elsewhere.
 
     Raises:
-        NotFoundError: the saved map it localises in is not there.
-        InputError: it was localised off board.
+        NotFoundError: the saved map used for localisation is missing.
+        InputError: an external program localised the robot.
     """
     slam = config.slam
     if slam is not None and slam.mode == "ros2":
@@ -95,7 +95,7 @@ def replayable(config: TruckConfig) -> TruckConfig:
 
 
 def outputs_of(config: TruckConfig) -> frozenset[str]:
-    """Topics a replay of this configuration computes again."""
+    """Return the topics recomputed by a replay of this configuration."""
     config, devices = replayable(config), config.devices
     names = {topics.TRANSFORMS.name}
     if config.missing_actuators() is None:
@@ -116,7 +116,7 @@ def outputs_of(config: TruckConfig) -> frozenset[str]:
 
 
 def why_no_goals(own: TruckConfig, used: TruckConfig, log: GoalRecord) -> str | None:
-    """Reason why the planner of a robot cannot be computed again; None if it can, or there is none."""
+    """Return why the planner of a robot cannot be replayed; None if it can, or there is none."""
     if own.own_planner is None or used.own_planner is None:
         return None if own.own_planner is used.own_planner else "only one of the two configurations has a planner"
     if not log.reports:
@@ -129,17 +129,17 @@ def why_no_goals(own: TruckConfig, used: TruckConfig, log: GoalRecord) -> str | 
 
 
 def without_goals(config: TruckConfig) -> TruckConfig:
-    """A configuration whose planner is not computed again, nor the tracker that drives to its goals."""
+    """Return a configuration without planner, and without the tracker that drives to its goals."""
     return config.model_copy(update={"planner": None, "tracker": None})
 
 
 def period_of(planner: PlannerConfig) -> int:
-    """Between two ticks of the goal service, ns."""
+    """Return the period of the goal service's ticks, ns."""
     return round(SECOND / planner.rate)
 
 
 def unseen_ticks(config: TruckConfig, log: Survey) -> list[tuple[int, str]]:
-    """Ticks that left nothing in the log: when, ns, and whose; in their order."""
+    """Return the ticks that left nothing in the log, in order: time (ns) and service."""
     early = [(instant, "odometry") for instant in _early_ticks(config, log)]
     if config.own_planner is None or not log.goals.reports:
         return early
@@ -147,10 +147,10 @@ def unseen_ticks(config: TruckConfig, log: Survey) -> list[tuple[int, str]]:
 
 
 def _early_ticks(config: TruckConfig, log: Survey) -> Iterable[int]:
-    """Ticks of odometry before its first output: its schedule, continued back from there.
+    """Return the ticks of odometry before its first output: its schedule, extrapolated back.
 
-    It publishes from its first tick after the first reading of every shaft, however late a busy computer came to
-    that tick: there was none in between.
+    It publishes from its first tick after the first reading of every shaft, however late a busy computer executed that
+    tick: there was none in between.
     """
     first = log.first.get(topics.ODOMETRY.name)
     if first is None:
@@ -164,7 +164,7 @@ def _early_ticks(config: TruckConfig, log: Survey) -> Iterable[int]:
 
 
 class Chain:
-    """Takes the messages of a log in their order.
+    """Processes the messages of a log in order.
 
     Args:
         config: configuration of the robot; see ``replayable``.
@@ -201,7 +201,7 @@ class Chain:
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """The services run while the context lasts.
+        """Run the services while the context is open.
 
         Raises:
             TruckError: a service failed.
@@ -220,7 +220,7 @@ class Chain:
             raise first_of(group, BaseException) or group from None
 
     async def take(self, topic: Topic[Message], message: Message, log_time: int) -> None:
-        """Hand over an input, recorded at ``log_time``, ns."""
+        """Deliver an input recorded at ``log_time``, ns."""
         await self._catch_up(log_time)
         if topic is topics.SCAN:
             assert isinstance(message, LaserScan)
@@ -232,7 +232,7 @@ class Chain:
         await asyncio.sleep(0)  # who waits for it goes first
 
     async def tick(self, outputs: Sequence[LogMessage]) -> None:
-        """The writer of ``outputs``, recorded in a row, had its turn then; their readers did not run in between."""
+        """Execute the tick that wrote ``outputs``, recorded in a row; their readers did not run in between."""
         await self._catch_up(outputs[0].log_time)
         for output in outputs:
             await self._take_unseen_turns(output.log_time)
@@ -248,7 +248,7 @@ class Chain:
                 await self._lead(output)
 
     async def answer(self, output: LogMessage) -> None:
-        """The worker's result counted now, as its first output shows; its last one is how well the scan fitted."""
+        """Deliver the worker's result, whose first output this is; its last one states the fit of the scan."""
         await self._catch_up(output.log_time)
         if self._turns is None:
             return
@@ -267,11 +267,11 @@ class Chain:
 
     @property
     def stamps_tilt(self) -> bool:
-        """Whether scans get the tilt of their plane here."""
+        """Whether scans receive the tilt of their plane here."""
         return isinstance(self._scans, TiltStamper)
 
     def ticks(self, output: LogMessage) -> bool:
-        """Whether a recorded message shows when a service had its turn."""
+        """Whether a recorded message reveals a tick of a service."""
         called = output.topic == topics.PATH.name and _near(self._called, output.stamp) is not None
         return called or self._writer_of(output) in self._paces
 
@@ -280,14 +280,14 @@ class Chain:
         return topic in self._inputs
 
     def as_computed(self, topic: Topic[Message], message: Message, payload: bytes) -> bytes:
-        """An output's bytes as they would be if the computed path had been driven."""
+        """Return an output's bytes as they would be if the computed path had been driven."""
         if not isinstance(message, Path):
             return payload
         computed = self._book.as_computed(message)
         return payload if computed is message else wire.encode(topic, computed)
 
     def _writer_of(self, output: LogMessage) -> str:
-        """Service that had its turn when ``output`` was written; its topic if no turn is awaited."""
+        """Return the service whose tick wrote ``output``; its topic if no tick is awaited."""
         if output.topic == topics.PATH.name and _near(self._goal_ticks, output.stamp) is not None:
             return output.topic if is_deformed(output) else GoalService.name
         if output.topic == topics.PLAN_DRIVE.name and self._goals is not None and asks_standstill(output):
@@ -295,16 +295,16 @@ class Chain:
         return SERVICES.get(output.topic, output.topic)
 
     def _is_start(self, output: LogMessage) -> bool:
-        """Whether it is the goal service's first report, which it gives before its first tick."""
+        """Whether it is the goal service's first report, sent before its first tick."""
         return output.topic == topics.GOAL.name and output.stamp == self._goal_record.start
 
     def _turn_of(self, service: str, output: LogMessage) -> int:
-        """Time of that turn, ns: messages of one turn of the goal service on the wall clock have several stamps."""
+        """Return the time of that tick (ns); on the wall clock its messages have several stamps."""
         near = _near(self._goal_ticks, output.stamp) if service == GoalService.name else None
         return output.stamp if near is None else near
 
     async def _call(self, call: RecordedCall, instant: int) -> None:
-        """A request reached the goal service, at ``instant``, ns; earlier turns go first."""
+        """Deliver a request to the goal service at ``instant`` (ns), after all earlier ticks."""
         await asyncio.sleep(0)
         gate = self.bus.newest(topics.GATE)
         if self._goals is None or gate is None:
@@ -315,7 +315,7 @@ class Chain:
             self._goals.tasks.take(request)
 
     async def _lead(self, output: LogMessage) -> None:
-        """A recorded path that was not computed is given, for the truck drove it."""
+        """Deliver a recorded path that was not computed, because the truck drove it."""
         for _ in range(LINKS):
             if (newest := self.bus.newest(topics.PATH)) is not None and newest.stamp >= output.stamp:
                 return
@@ -332,7 +332,7 @@ class Chain:
         await self._clock.reach(instant)
 
     async def _take_unseen_turns(self, instant: int) -> None:
-        """Those up to ``instant``, ns; at that instant before everything recorded: none of it shows in them."""
+        """Execute the unseen ticks up to ``instant`` (ns); at that instant, before everything recorded."""
         while self._unseen and self._unseen[0][0] <= instant:
             due, service = self._unseen.popleft()
             await self._clock.reach(due)
@@ -363,10 +363,10 @@ class Chain:
 
 
 def _near(instants: Sequence[int], stamp: int) -> int | None:
-    """The instant, of some in their order, that a stamp belongs to, ns."""
+    """Return the instant, of an increasing sequence, that a stamp belongs to, ns."""
     at = bisect_left(instants, stamp - TOGETHER)
     return instants[at] if at < len(instants) and instants[at] <= stamp + TOGETHER else None
 
 
 def _nothing() -> None:
-    """Readiness is of no interest here."""
+    """Ignore readiness."""

@@ -1,10 +1,11 @@
-"""Computes a log again and compares the result with the recorded outputs.
+"""Recomputes a log and compares the result with the recorded outputs.
 
-Outputs of services in the daemon's loop follow from the log's messages and their order alone, so they are expected bit
-for bit. So are the estimation worker's outputs, and outputs based on them, in a log of the virtual clock. On the wall
-clock the log shows when the worker's results arrived, but not which of two simultaneous inputs it had read: there,
-outputs based on them may differ by 0.02 (SI units), and its own messages are shown, not judged. So are paths to goals,
-whose search ended by time there, not by work, and reports on goals: most results of their workers show nowhere.
+Outputs of services in the daemon's loop follow from the log's messages and their order alone, so they must be equal bit
+for bit. So must the estimation worker's outputs, and outputs based on them, in a log of the virtual clock. On the wall
+clock the log shows when the worker's results arrived, but not which of two simultaneous inputs it had read: outputs
+based on them may differ by 0.02 (SI units), and its own messages are shown, not judged. So are paths to goals, whose
+search there was limited by time, not by work, and reports on goals, because most results of their workers are not
+recorded.
 """
 
 import asyncio
@@ -44,17 +45,17 @@ def check_log(
     tolerance: float | None = None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> CheckedReplay:
-    """Compute the outputs of ``log`` again and compare them.
+    """Recompute the outputs of ``log`` and compare them.
 
     Args:
         log: file to read; of a run in several parts any one stands for all, a black box for its run up to its end.
-        config: another configuration to compute with; None: the log's own.
-        tolerance: greatest difference that agrees, in SI units, instead of the ones above.
+        config: another configuration to use; None: the log's own.
+        tolerance: maximum difference that agrees, in SI units, instead of the ones above.
         progress: called with the bytes of the run read so far.
 
     Raises:
         NotFoundError: no such log, configuration or saved map.
-        InputError: the log holds no configuration, no sensors, no outputs, or has no first part.
+        InputError: the log contains no configuration, no sensors, no outputs, or has no first part.
         ConfigError: a configuration is refused.
         WorkerError: the estimation worker failed.
     """
@@ -165,7 +166,7 @@ def _into(comparisons: Mapping[str, TopicComparison], chain: Chain) -> TapCallba
 
 
 def _inexact(*configs: TruckConfig) -> tuple[frozenset[str], frozenset[str]]:
-    """Topics that may differ a little on the wall clock, and topics that are not judged."""
+    """Return the topics that may differ a little on the wall clock, and those that are not judged."""
     loose, shown = frozenset[str](), frozenset[str]()
     if any(config.slam is not None for config in configs):
         loose, shown = RESTS_ON_WORKER, shown | frozenset(WORKER)

@@ -1,4 +1,4 @@
-"""How far recorded and recomputed outputs of a topic are apart: metres, angles, other numbers, else text."""
+"""Differences between recorded and recomputed outputs of a topic: metres, angles, other numbers, else text."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -42,13 +42,13 @@ class Difference:
 
 
 def differences(before: Message, after: Message) -> list[Difference]:
-    """Every field that differs between two messages, except headers; NaN is infinitely far from any number."""
+    """Return every field that differs between two messages, except headers; NaN is infinitely far from any number."""
     found = (replace(one, value=math.inf) if math.isnan(one.value) else one for one in _walk("", before, after))
     return [one for one in found if one.value > 0]
 
 
 def same_header(before: Message, after: Message) -> bool:
-    """Whether stamps and number are the same."""
+    """Whether stamps and sequence numbers are equal."""
     return all(getattr(before, name) == getattr(after, name) for name in HEADER)
 
 
@@ -77,7 +77,7 @@ def _walk(name: str, a: Any, b: Any) -> Iterator[Difference]:
 
 
 def _figure(name: str, a: Any, b: Any) -> Iterator[Difference]:
-    """Difference of composite values, such as poses and grids."""
+    """Yield the differences of composite values, such as poses and grids."""
     if isinstance(a, Transform):
         yield from _transform(name, a, b)
     elif isinstance(a, Grid):
@@ -93,19 +93,19 @@ def _number(name: str, a: float, b: float) -> Difference:
 
 
 def _turn(a: float, b: float) -> float:
-    """Between two angles, rad; infinite if only one of them is finite."""
+    """Return the difference of two angles, rad; infinite if only one of them is finite."""
     if _same(a, b):
         return 0.0
     return abs(wrap_angle(b - a)) if math.isfinite(b - a) else math.inf
 
 
 def _distance(a: Sequence[float], b: Sequence[float]) -> float:
-    """Between two points; equal coordinates, or both NaN, have distance 0."""
+    """Return the distance of two points; equal coordinates, or both NaN, have distance 0."""
     return math.hypot(*(0.0 if _same(one, other) else other - one for one, other in zip(a, b, strict=True)))
 
 
 def _same(a: Any, b: Any) -> Any:
-    """Equal, or NaN both; of arrays for each element."""
+    """Whether both are equal or NaN; of arrays for each element."""
     return (a == b) | ((a != a) & (b != b))  # NaN alone differs from itself
 
 
@@ -130,7 +130,7 @@ def _transform(name: str, a: Transform, b: Transform) -> Iterator[Difference]:
 
 
 def _path(a: Path, b: Path) -> Iterator[Difference]:
-    """How far the two lead apart: Hausdorff distance of their poses, and the angle between the nearest ones."""
+    """Yield the distance of two paths: Hausdorff distance of their poses, and the angle between the nearest ones."""
     if not len(a.poses) or not len(b.poses):
         yield _text("poses", len(a.poses), len(b.poses))
         return
@@ -146,7 +146,7 @@ def _path(a: Path, b: Path) -> Iterator[Difference]:
 
 
 def _grid(a: Grid, b: Grid) -> Iterator[Difference]:
-    """Mean difference of the cells' occupancy, 0..1: a single cell means little."""
+    """Yield the mean difference of the cells' occupancy, 0..1: single cells mean little."""
     yield from _walk("origin", a.origin, b.origin)
     yield _text("size", (a.width, a.height, a.resolution), (b.width, b.height, b.resolution))
     if a.cells.shape == b.cells.shape:
@@ -172,7 +172,7 @@ class GreatestDifference:
 
 @dataclass(frozen=True, slots=True)
 class FirstDifference:
-    """The first output that is off by more than the tolerance."""
+    """The first output that differs by more than the tolerance."""
 
     topic: str
     sequence: int
@@ -194,8 +194,8 @@ class TopicComparison:
     """Comparison of one topic. The n-th recorded output is compared with the n-th of the replay.
 
     Args:
-        topic: its row of the table.
-        tolerance: maximum difference of an agreeing field, SI units; 0 = equal bit for bit.
+        topic: row of the topic table.
+        tolerance: maximum difference of an agreeing field, SI units; 0: equal bit for bit.
         begin: start of the log, ns.
         judged: whether a difference matters.
     """
@@ -217,7 +217,7 @@ class TopicComparison:
     _again: dict[int, _TopicOutput] = field(default_factory=dict)
 
     def recorded(self, sequence: int, time: int, payload: bytes) -> None:
-        """Take an output of the log: its number in the run, when (ns), its bytes."""
+        """Add an output of the log: its number in the run, time (ns), bytes."""
         output = _TopicOutput(time, payload)
         if (again := self._again.pop(sequence, None)) is not None:
             self._compare(sequence, output, again)
@@ -225,7 +225,7 @@ class TopicComparison:
             self._recorded[sequence] = output
 
     def recomputed(self, time: int, payload: bytes) -> None:
-        """Take the next output of the replay."""
+        """Add the next output of the replay."""
         sequence, output = self._count, _TopicOutput(time, payload)
         self._count += 1
         if (recorded := self._recorded.pop(sequence, None)) is not None:
@@ -235,19 +235,19 @@ class TopicComparison:
 
     @property
     def missing(self) -> int:
-        """Recorded outputs that the replay did not give."""
+        """Number of recorded outputs that the replay did not produce."""
         return len(self._recorded)
 
     def surplus(self, end: int) -> int:
-        """Outputs of the replay that were not recorded, until ``end``, ns."""
+        """Return the number of unrecorded outputs of the replay until ``end``, ns."""
         return sum(output.time <= end for output in self._again.values())
 
     def agrees(self, end: int) -> bool:
-        """Whether every output came again, until ``end``, ns, within the tolerance."""
+        """Whether every output until ``end`` (ns) was reproduced within the tolerance."""
         return not self.judged or self.differing == self.missing == self.surplus(end) == 0
 
     def within(self, end: int, limit: float) -> bool:
-        """Whether it agrees or, with every output and header as recorded, no field is off by more than ``limit``."""
+        """Whether it agrees or, with all outputs and headers as recorded, no field differs by more than ``limit``."""
         close = self.headers == 0 and all(one.value <= limit for one in self.greatest.values())
         return self.agrees(end) or (close and self.missing == self.surplus(end) == 0)
 

@@ -1,7 +1,7 @@
 """Reads the record of goals from a log before its replay: ticks of the goal service, remote calls, and paths found.
 
-The log does not hold all of it: most ticks publish nothing, and remote calls are not recorded. Results of the workers
-are inferred from the paths that were driven, decisions and calls from the reports on goals.
+The record is incomplete: most ticks publish nothing, and remote calls are not recorded. Results of the workers are
+inferred from the paths that were driven, decisions and calls from the reports on goals.
 """
 
 import itertools
@@ -34,7 +34,7 @@ TOGETHER: Final = SECOND // 50
 
 @dataclass(frozen=True, slots=True)
 class RecordedCall:
-    """A remote call, as the report on the goal shows it."""
+    """A remote call, inferred from the report on the goal."""
 
     source: str
     frame: str
@@ -42,7 +42,7 @@ class RecordedCall:
     """The goal, or an order about it."""
 
     def request(self, gate: GateState, stamp: int, seq: int) -> GoalRequest | GoalControl:
-        """The request behind a report, without unreported fields, with the rights it must have had."""
+        """Return the request behind a report, without unreported fields, with the rights it must have had."""
         header: dict[str, Any] = {
             "stamp": stamp,
             "received": stamp,
@@ -61,7 +61,7 @@ class RecordedCall:
 
 @dataclass(frozen=True, slots=True)
 class GoalReport:
-    """A report on the goal, where it stood in the log."""
+    """A report on the goal, with its position in the log."""
 
     sequence: int
     state: GoalState
@@ -81,7 +81,7 @@ class GoalRecord:
     """Number of the latest report that the replay has reached."""
 
     def note(self, entry: LogMessage) -> None:
-        """Take in a message of the log."""
+        """Process a message of the log."""
         if entry.topic in ASKED:
             self.asked.append(entry.log_time)
             return
@@ -103,11 +103,11 @@ class GoalRecord:
 
     @property
     def start(self) -> int | None:
-        """When the service reported first, ns; None in a log without goals."""
+        """Time of the service's first report, ns; None in a log without goals."""
         return self.reports[0].state.stamp if self.reports else None
 
     def ticks(self, period: int) -> list[int]:
-        """Instants of the ticks that show: the earliest stamp of each one's outputs, which is nearest to its start."""
+        """Return the times of visible ticks: the earliest stamp of each one's outputs."""
         calls = self.calls(period)
         stamps = [one.state.stamp for one in self.reports if one.sequence not in calls] + self.planner_requests
         shown: list[int] = []
@@ -118,7 +118,7 @@ class GoalRecord:
         return [min((stamp for stamp in own if 0 <= tick - stamp <= TOGETHER), default=tick) for tick in shown]
 
     def unseen_ticks(self, period: int) -> list[int]:
-        """Instants of those between them that left nothing while a goal was pursued, so that no report was due."""
+        """Return the times of the ticks between them that published nothing while a goal was pursued."""
         stamps = [one.state.stamp for one in self.reports]
         found: list[int] = []
         for before, after in itertools.pairwise(self.ticks(period)):
@@ -130,7 +130,7 @@ class GoalRecord:
         return found
 
     def calls(self, period: int) -> dict[int, RecordedCall]:
-        """Requests by remote call, by the number of the report that shows them.
+        """Return requests by remote call, by the number of the report that shows them.
 
         Requests by topic are in the log itself, and show within two ticks.
         """
@@ -149,9 +149,9 @@ class GoalRecord:
         return any(one.sequence in goals and one.state.waypoints for one in self.reports)
 
     def decided(self) -> int | None:
-        """Time of the route planner's answer to a request made now, ns; None if it was dropped.
+        """Return the time of the route planner's answer to a request made now, ns; None if it was dropped.
 
-        Reports of the turn that made the request are stamped later than its first output.
+        Reports of the tick that made the request are stamped later than its first output.
         """
         for before, after in itertools.pairwise(self.reports):
             if after.sequence > self.replayed and _answered(before.state, after.state):
@@ -159,7 +159,7 @@ class GoalRecord:
         return None
 
     def path_between(self, begin: int, end: int, name: str) -> Path | None:
-        """First path published after ``begin`` and until ``end``, ns, whose name fits the pattern."""
+        """Return the first path published after ``begin`` and until ``end``, ns, whose name matches the pattern."""
         found = (path for path in self.paths if begin < path.stamp <= end)
         return next((path for path in found if re.fullmatch(name, path.name)), None)
 

@@ -1,9 +1,9 @@
-"""A clock for services to tick as they did in a recorded run, not by their schedules.
+"""A clock that lets services tick as in a recorded run, instead of by their schedules.
 
-A tick on the wall clock comes some time after it is due; whether a reading in between was taken follows from the log.
-Messages are logged in the order of their publication, and a service that reads its inputs and publishes without an
-await in between has read exactly those before its output. So its tick waits until the replay reaches that output, and
-has that output's stamp as its time.
+A tick on the wall clock is executed some time after it is due; whether a reading in between was used follows from the
+log. Messages are logged in the order of their publication, and a service that reads its inputs and publishes without an
+await in between has read exactly those before its output. Its tick therefore waits until the replay reaches that
+output, and has that output's stamp as its time.
 """
 
 import asyncio
@@ -27,7 +27,7 @@ class Pace:
         self._held: asyncio.Future[None] | None = None
 
     def adopt(self) -> None:
-        """The running task ticks by this; tasks that it starts do not."""
+        """Use this pace for the running task; not for tasks that it starts."""
         task = asyncio.current_task()
         assert task is not None
         _PACES[task] = self
@@ -40,7 +40,7 @@ class Pace:
 
     @contextmanager
     def borrowed(self, instant: int) -> Iterator[None]:
-        """For the running task it is ``instant``, ns, while the context lasts."""
+        """Set the running task's time to ``instant``, ns, while the context is open."""
         self.instant = instant
         self.adopt()
         yield
@@ -49,7 +49,7 @@ class Pace:
         del _PACES[task]
 
     async def hold(self) -> None:
-        """Called by the service's clock: wait for the next tick."""
+        """Wait for the next tick; called by the service's clock."""
         self._held = asyncio.get_running_loop().create_future()
         try:
             await self._held
@@ -57,7 +57,7 @@ class Pace:
             self._held = None
 
     async def release(self, instant: int) -> None:
-        """Let the service have its turn at ``instant``, ns, when the loop comes to it; once for each instant."""
+        """Execute the service's tick at ``instant``, ns, in a later loop iteration; once for each instant."""
         if instant == self.instant:
             return
         while self._held is None or self._held.done():
@@ -67,14 +67,14 @@ class Pace:
 
 
 class RecordedTurns:
-    """Results of the worker count when the log shows them, however long the worker takes now."""
+    """Delivers results of the worker when the log shows them, however long the worker takes now."""
 
     def __init__(self) -> None:
         self._waiting: deque[asyncio.Future[None]] = deque()
         self._open = False
 
     async def wait(self, _: VirtualClock, due: int) -> None:
-        """Wait for ``next``; when the worker was thought to be done, ``due``, does not matter."""
+        """Wait for ``next``; the time when the worker's result was due is ignored."""
         del due
         if self._open:
             return
@@ -91,7 +91,7 @@ class RecordedTurns:
                 return
 
     def open(self) -> None:
-        """Nothing waits any longer: the log is at its end."""
+        """Stop waiting: the log has ended."""
         self._open = True
         while self._waiting:
             self.next()
@@ -114,5 +114,5 @@ class PacedClock(ReplayClock):
             await pace.hold()
 
     async def reach(self, instant: int) -> None:
-        """Wait until ``instant`` to the nanosecond: a jump of the loop ends one beyond its timer."""
+        """Wait until ``instant`` to the nanosecond: a jump of the loop ends one nanosecond after its timer."""
         await super().sleep_until(instant - 1)

@@ -27,10 +27,10 @@ Identity = tuple[dict[str, str], dict[str, bytes]]
 
 
 def parts_of(log: Path) -> list[Path]:
-    """All parts of the run of ``log``, in their order; ``log`` alone if the recorder did not name it.
+    """Return all parts of the run of ``log``, in order; only ``log`` if the recorder did not name it.
 
     Raises:
-        InputError: the run's first part is not there.
+        InputError: the run's first part is missing.
     """
     named = NAME.fullmatch(log.name)
     if named is None or not log.is_file():
@@ -44,14 +44,14 @@ def parts_of(log: Path) -> list[Path]:
 
 
 def run_of(log: Path) -> tuple[Path, int | None]:
-    """Log to compute again for ``log``, whose filters begin with its run, and its end in daemon time, ns.
+    """Return the log to recompute for ``log``, so that filters begin with its run, and its end in daemon time, ns.
 
     Returns:
         The log itself, to its end; for a black box a log of its run, up to the end of the box.
 
     Raises:
         NotFoundError: no such log.
-        InputError: not a log, or the run's log of a black box is gone.
+        InputError: not a log, or the run's log of a black box is missing.
     """
     reader = open_log(log)
     named = reader.metadata().get("run", {}).get(RUN_LOG)
@@ -65,7 +65,7 @@ def run_of(log: Path) -> tuple[Path, int | None]:
 
 
 class RunLog:
-    """The messages of a run, once or again; ends at the first error, or before a part that is not there.
+    """The messages of a run, readable repeatedly; ends at the first error, or before a missing part.
 
     Args:
         log: any part of it, or a log under another name.
@@ -91,17 +91,17 @@ class RunLog:
 
     @property
     def parts(self) -> tuple[Path, ...]:
-        """The files, in their order."""
+        """The files, in order."""
         return tuple(reader.path for reader in self._readers)
 
     @property
     def position(self) -> int:
-        """Bytes an iteration has read so far."""
+        """Bytes read so far by an iteration."""
         return self._before + self._reader.position
 
     @property
     def first(self) -> LogReader:
-        """Attachments of the first part: they belong to the run."""
+        """Return the first part, whose attachments belong to the run."""
         return self._readers[0]
 
     def __iter__(self) -> Iterator[LogMessage]:
@@ -148,7 +148,7 @@ SIMULATION: Final = "sim"
 
 @dataclass(slots=True)
 class Survey:
-    """Of one log."""
+    """Summary of one log."""
 
     start: int
     """Log time of the first message, ns."""
@@ -174,7 +174,7 @@ def survey(log: RunLog) -> Survey:
     """Read the log once.
 
     Raises:
-        InputError: it holds no messages, or none of a sensor.
+        InputError: it contains no messages, or none of a sensor.
     """
     found: Survey | None = None
     for entry in log:
@@ -204,7 +204,7 @@ def _note_ready(entry: LogMessage, ready: dict[str, int]) -> None:
 
 
 def recorded_config(log: Path, attachments: Mapping[str, bytes]) -> TruckConfig:
-    """The configuration the log was recorded with.
+    """Return the configuration of the recorded run.
 
     Raises:
         InputError: it is not attached, or damaged.

@@ -13,7 +13,7 @@ ROUND_OFF: Final = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Unreadable:
-    """A sensor's message whose bytes are none of its topic."""
+    """A sensor's message with bytes invalid for its topic."""
 
     topic: str
     sequence: int
@@ -24,7 +24,7 @@ class Unreadable:
 
 @dataclass(frozen=True, slots=True)
 class CheckedReplay:
-    """What came out."""
+    """Result of a check."""
 
     log: Path
     parts: tuple[Path, ...]
@@ -45,7 +45,7 @@ class CheckedReplay:
 
     @property
     def compared(self) -> int:
-        """Outputs that were recorded and came again."""
+        """Number of recorded outputs that were reproduced."""
         return sum(comparison.compared for comparison in self.topics)
 
     @property
@@ -55,7 +55,7 @@ class CheckedReplay:
 
     @property
     def first(self) -> FirstDifference | None:
-        """The first output that is off by more than its topic's tolerance."""
+        """The first output that differs by more than its topic's tolerance."""
         return min(
             (comparison.first for comparison in self.topics if comparison.first),
             key=lambda first: first.at,
@@ -64,18 +64,18 @@ class CheckedReplay:
 
     @property
     def agrees(self) -> bool:
-        """Whether everything came again within the tolerance."""
+        """Whether everything was reproduced within the tolerance."""
         return all(comparison.agrees(self.end) for comparison in self.topics) and not self.unreadable
 
     @property
     def rounded(self) -> bool:
-        """Whether it does not agree, but nothing is off by more than ``ROUND_OFF``."""
+        """Whether it does not agree, but nothing differs by more than ``ROUND_OFF``."""
         close = all(comparison.within(self.end, ROUND_OFF) for comparison in self.topics) and not self.unreadable
         return close and not self.agrees
 
     @property
     def sufficient(self) -> float:
-        """Tolerance, SI units, that makes a ``rounded`` check agree."""
+        """Tolerance (SI units) with which a ``rounded`` check agrees."""
         return max([ROUND_OFF, *(comparison.tolerance for comparison in self.topics if comparison.judged)])
 
     @property
@@ -86,7 +86,7 @@ class CheckedReplay:
         return Reason.OK if self.agrees or self.config is not None else Reason.REPLAY_DIFFERS
 
     def figures(self) -> dict[str, Any]:
-        """Everything as plain values for JSON: non-finite numbers become null."""
+        """Return everything as plain values for JSON: non-finite numbers become null."""
         return {
             "log": str(self.log),
             "parts": [str(part) for part in self.parts],

@@ -1,1 +1,1 @@
-"""Certificates of a robot and its stations: authority, issue, renewal, revocation, and the check of a running robot."""
+"""Certificates of a robot and its stations: authority, issue, renewal, revocation, and a test of a running robot."""

@@ -37,7 +37,7 @@ class Certificate:
 
     @property
     def key_pem(self) -> bytes:
-        """The key as PEM, not encrypted: who reads the file has it."""
+        """The key as PEM, unencrypted: every reader of the file has it."""
         return self.key.private_bytes(
             serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
         )
@@ -58,7 +58,7 @@ def load(certificate: Path, key: Path) -> Certificate:
     """Read both files.
 
     Raises:
-        InputError: one is not there, or no certificate or key of this kind.
+        InputError: one is missing, or no certificate or key of this kind.
     """
     loaded = read_certificate(certificate)
     with reading(key, "a private key"):
@@ -88,33 +88,33 @@ def read_certificates(path: Path) -> list[x509.Certificate]:
 
 
 def common_name(certificate: x509.Certificate) -> str:
-    """Whom a certificate names; its whole subject if it has no common name."""
+    """Return the common name of a certificate, or its whole subject without one."""
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     return str(names[0].value) if names else certificate.subject.rfc4514_string()
 
 
 def seconds_left(certificate: x509.Certificate, now: int) -> int:
-    """Seconds until a certificate expires.
+    """Return the seconds until a certificate expires.
 
     Args:
-        certificate: which.
+        certificate: certificate to examine.
         now: real time, s.
     """
     return round(certificate.not_valid_after_utc.timestamp()) - now
 
 
 def began(certificate: x509.Certificate) -> int:
-    """Start of a certificate's validity, real time, s."""
+    """Return the start of a certificate's validity, real time, s."""
     return round(certificate.not_valid_before_utc.timestamp())
 
 
 def new_authority(name: str, now: int, days: int) -> Certificate:
-    """A self-signed authority.
+    """Create a self-signed authority.
 
     Args:
         name: common name.
         now: real time, s.
-        days: until it expires.
+        days: validity.
     """
     key = ec.generate_private_key(ec.SECP256R1())
     subject = _name(name)
@@ -122,21 +122,21 @@ def new_authority(name: str, now: int, days: int) -> Certificate:
 
 
 def new_issuer(authority: Certificate, name: str, now: int, days: int) -> Certificate:
-    """An authority below ``authority`` that certifies nothing but end entities."""
+    """Create an authority below ``authority`` that may only certify end entities."""
     key = ec.generate_private_key(ec.SECP256R1())
     builder = _builder(_name(name), authority.certificate.subject, key, now, days * DAY)
     return Certificate(_authority(builder, authority.key, 0), key)
 
 
 def issue(issuer: Certificate, name: str, now: int, seconds: int, *, server: Sequence[str] = ()) -> Certificate:
-    """A certificate of a station, or of a robot that others dial.
+    """Create a certificate of a station, or of a robot that accepts connections.
 
     Args:
-        issuer: who signs it.
+        issuer: signing authority.
         name: common name.
         now: real time, s.
-        seconds: until it expires.
-        server: addresses and host names that stations dial; none for a station.
+        seconds: validity, s.
+        server: addresses and host names used by stations; none for a station.
     """
     key = ec.generate_private_key(ec.SECP256R1())
     usages = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if server else [])]
@@ -202,5 +202,5 @@ def _general_name(address: str) -> x509.GeneralName:
 
 
 def _date(seconds: int) -> Any:
-    """UTC as the library wants it."""
+    """Convert to the library's UTC date."""
     return np.datetime64(seconds, "s").item()

@@ -1,6 +1,6 @@
 """Tests a running robot from outside: admitted clients, delivered and dropped messages.
 
-Nothing moves: the order that shows whether orders arrive carries no nonce, so that the gate refuses it.
+Nothing moves: the order used to test delivery has no nonce, so the gate refuses it.
 """
 
 import socket
@@ -31,7 +31,7 @@ LONG_LIFE: Final = 600
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One attempt."""
+    """One attempt and its result."""
 
     who: str
     expected: str
@@ -40,16 +40,16 @@ class Case:
 
 
 async def check(folder: Folder, endpoint: str, clock: Clock) -> list[Case]:
-    """Try everything at ``endpoint``.
+    """Run all attempts at ``endpoint``.
 
     Args:
-        folder: folder of the authority, whose certificates are made for the purpose and thrown away.
+        folder: folder of the authority, which issues temporary certificates for the test.
         endpoint: endpoint of the robot, ``tls/...``.
-        clock: time.
+        clock: source of time.
 
     Raises:
         InputError: no TLS endpoint, or the folder has no pilot and no engineer.
-        NotFoundError: nothing listens there, or there is no authority.
+        NotFoundError: no process listens there, or there is no authority.
     """
     if protocol_of(endpoint) != "tls":
         raise InputError(f"{endpoint}: expected a tls/HOST:PORT endpoint")
@@ -65,8 +65,8 @@ class _Attempt:
     Args:
         folder: folder of the authority.
         endpoint: endpoint of the robot.
-        clock: time.
-        scratch: for certificates.
+        clock: source of time.
+        scratch: folder for certificates.
     """
 
     def __init__(self, folder: Folder, endpoint: str, clock: Clock, scratch: Path) -> None:
@@ -75,7 +75,7 @@ class _Attempt:
         self._ca = folder.path / "authority.pem"
 
     async def reachable(self) -> None:
-        """Raises NotFoundError where nothing listens."""
+        """Raise NotFoundError if no process listens there."""
         place = host_of(self._endpoint), port_of(self._endpoint) or 0
         try:
             (await in_thread(lambda: socket.create_connection(place, ABSENCE_TIMEOUT))).close()
@@ -195,7 +195,7 @@ class _Attempt:
             yield client
 
     def _handshake(self, tls: ClientTls | None) -> str:
-        """Why a link is refused; "" if it is not."""
+        """Return why a link is refused; "" if it is accepted."""
         try:
             return link_refusal(self._endpoint, self._ca, tls, ABSENCE_TIMEOUT)
         except OSError as error:
@@ -211,7 +211,7 @@ async def _arrives(call: Awaitable[object]) -> bool:
 
 
 async def _refusal(client: TruckClient) -> Reason | None:
-    """Reason of the refusal of an obviously invalid order; None if it is answered otherwise."""
+    """Return the reason for refusing an obviously invalid order; None for another answer."""
     now = 0
     header = {"stamp": now, "received": now, "seq": now, "source": client.source, "role": client.role, "lease": 0.1}
     try:

@@ -5,9 +5,9 @@
     authority.pem authority.key     the authority; the key stays here
     register.yaml                   robot, addresses, stations with role and rank
     issuers/NAME.pem .key           one per station; the keys stay here
-    robot/                          to the robot: zenoh.yaml, its certificate and key, whom it lets in
-    stations/NAME/                  to the station: its certificate and key, the authority's certificate
-    router.pem                      authority of the fleet's router, where there is one
+    robot/                          for the robot: zenoh.yaml, its certificate and key, admitted issuers
+    stations/NAME/                  for the station: its certificate and key, the authority's certificate
+    router.pem                      authority of the fleet's router, if there is one
 """
 
 import fcntl
@@ -62,14 +62,14 @@ Rank = Literal[Role.GAMEPAD, Role.KEYBOARD, Role.STATION]
 
 
 class CertifiedStation(Schema):
-    """One certificate that is let in."""
+    """One admitted certificate."""
 
     role: AccessRole
     rank: Rank = Role.STATION
 
 
 class TrustedRouter(Schema):
-    """A router of the fleet that the robot dials."""
+    """A router of the fleet to which the robot connects."""
 
     name: OwnerName
     """Common name of its certificate."""
@@ -109,7 +109,7 @@ class CertificateRegister(Schema):
 
 @dataclass(frozen=True, slots=True)
 class Expiry:
-    """A certificate of the folder."""
+    """Expiry of a certificate in the folder."""
 
     name: str
     role: str
@@ -122,7 +122,7 @@ class Folder:
     """An authority's folder.
 
     Args:
-        path: path of it.
+        path: path of the folder.
     """
 
     def __init__(self, path: Path) -> None:
@@ -130,7 +130,7 @@ class Folder:
         self.robot = path / "robot"
 
     def register(self) -> CertificateRegister:
-        """Certified names.
+        """The register of certified names.
 
         Raises:
             NotFoundError: there is no authority here.
@@ -149,17 +149,17 @@ class Folder:
         now: int,
         days: int = ROBOT_DAYS,
     ) -> bool:
-        """Make an authority, or renew the robot's certificate; True if there was none.
+        """Create an authority, or renew the robot's certificate; return True if there was none.
 
         Args:
-            robot: its name; None, here and below, keeps the value; at first truck.
-            addresses: addresses of the robot, for stations; at first of this computer.
-            place: where the robot keeps its files.
+            robot: name of the robot; None, here and below, keeps the value; initially truck.
+            addresses: addresses of the robot, for stations; initially those of this computer.
+            place: folder of the robot's files on the robot.
             now: real time, s.
-            days: until the robot's certificate expires.
+            days: validity of the robot's certificate.
 
         Raises:
-            InputError: the names or days make no sense, or the register of an authority with stations is missing.
+            InputError: a name or number of days is invalid, or the register of an authority with stations is missing.
             OSError: the folder cannot be written.
         """
         named = {"robot": robot, "addresses": addresses, "place": place}
@@ -190,17 +190,17 @@ class Folder:
         return new
 
     def add(self, name: str, role: AccessRole | None, rank: Role | None, now: int, days: int = 365) -> bool:
-        """Certify a station, or renew its certificate; True if the robot must be restarted to know it.
+        """Certify a station, or renew its certificate; return True if the robot must be restarted to admit it.
 
         Args:
             name: common name, and the source of its requests.
-            role: its role; None keeps it, at first pilot.
-            rank: its maximum priority; None keeps it, at first station.
+            role: its role; None keeps it, initially pilot.
+            rank: its maximum priority; None keeps it, initially station.
             now: real time, s.
-            days: until its certificate expires.
+            days: validity of its certificate.
 
         Raises:
-            InputError: a name, rank or number of days that makes no sense.
+            InputError: a name, rank or number of days is invalid.
             NotFoundError: there is no authority here.
         """
         if not OWNER_NAME.fullmatch(name):
@@ -228,7 +228,7 @@ class Folder:
             return self._write(register)
 
     def revoke(self, name: str) -> None:
-        """Forget a station and its issuer.
+        """Remove a station and its issuer.
 
         Raises:
             NotFoundError: there is no such station.
@@ -246,15 +246,15 @@ class Folder:
             self._write(kept)  # last, so that an interrupted request can be repeated
 
     def join(self, name: str, endpoint: str, authority: bytes) -> None:
-        """Let the robot dial a router and its stations trust it.
+        """Make the robot connect to a router, and its stations trust it.
 
         Args:
             name: common name of the router's certificate.
-            endpoint: where it listens.
-            authority: who certified it, PEM.
+            endpoint: endpoint of the router.
+            authority: certificate of the router's authority, PEM.
 
         Raises:
-            InputError: the name is taken by a station.
+            InputError: a station has this name.
         """
         with self._alone():
             made = self.register().model_dump() | {"router": {"name": name, "endpoint": endpoint}}
@@ -275,11 +275,11 @@ class Folder:
         return load(*self._files("authority"))
 
     def issuer(self, name: str) -> Certificate:
-        """Who certifies a station. Raises as ``authority`` does."""
+        """Return the issuer of a station's certificate. Raises the errors of ``authority``."""
         return load(*self._files(f"issuers/{name}"))
 
     def certificates(self, now: int) -> list[Expiry]:
-        """Everything certified, with the days that are left.
+        """Return all certificates with their remaining days.
 
         Args:
             now: real time, s.
@@ -347,12 +347,12 @@ class Folder:
         return [self._files(f"issuers/{name}")[0].read_bytes() for name in names]
 
     def _router(self) -> bytes:
-        """Who certified the fleet's router; nothing without one."""
+        """Return the certificate of the router's authority; empty without one."""
         file = self.path / ROUTER_FILE
         return file.read_bytes() if file.exists() else b""
 
     def _trusted(self) -> bytes:
-        """Authorities that a station trusts: the robot's and the router's authority."""
+        """Return the authorities trusted by a station: the robot's and the router's."""
         return (self.path / "authority.pem").read_bytes() + self._router()
 
     def _files(self, name: str) -> tuple[Path, Path]:
@@ -360,7 +360,7 @@ class Folder:
 
 
 def _zenoh(register: CertificateRegister) -> dict[str, Any]:
-    """The robot's configuration as plain data."""
+    """Return the robot's configuration as plain data."""
     place = register.place
     tls: dict[str, Any] = {
         "ca": str(place / "stations.pem"),
@@ -386,7 +386,7 @@ def _zenoh(register: CertificateRegister) -> dict[str, Any]:
 
 
 def require_address(address: str) -> None:
-    """Refuse an address that no station can dial.
+    """Reject an address that stations cannot use.
 
     Raises:
         ValueError: it is neither an IP address nor a host name.
@@ -399,7 +399,7 @@ def require_address(address: str) -> None:
 
 
 def _require_time(authority: Certificate, now: int, days: int) -> None:
-    """Refuse a lifetime that ends after the authority expires.
+    """Reject a validity beyond that of the authority.
 
     Raises:
         InputError: the authority is not valid yet, as with a wrong clock, or expires earlier.

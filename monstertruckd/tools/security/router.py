@@ -1,11 +1,11 @@
-"""A router of a fleet: its certificate, whom it lets in and its access rules, from its robots' folders.
+"""A router of a fleet: its certificate, admitted clients and access rules, derived from its robots' folders.
 
 ::
 
-    authority.pem authority.key     certifies the router and nothing else; the key stays here
-    router/                         to the router: zenoh.json5, its certificate and key, whom it lets in
+    authority.pem authority.key     certifies only the router; the key stays here
+    router/                         for the router: zenoh.json5, its certificate and key, admitted issuers
 
-Robots and stations trust the router's authority from then on: their folders are written again.
+Robots and stations then trust the router's authority: their folders are rewritten.
 """
 
 import json
@@ -29,19 +29,19 @@ PLACE: Final = Path("/etc/zenohd")
 def make_router(
     path: Path, robots: Sequence[Folder], addresses: Sequence[str], now: int, place: Path = PLACE, port: int = PORT
 ) -> None:
-    """Make or renew a router's files, and make its robots and their stations trust it.
+    """Create or renew a router's files, and make its robots and their stations trust it.
 
     Args:
         path: folder of the router's authority.
         robots: folders of the robots' authorities.
-        addresses: addresses of the router, for robots and stations; robots dial the first one.
+        addresses: addresses of the router, for robots and stations; robots use the first one.
         now: real time, s.
         place: folder of the router's files.
-        port: where it listens.
+        port: its port.
 
     Raises:
-        InputError: two of them have one name, or an address is none.
-        NotFoundError: a folder is none of an authority.
+        InputError: two of them have the same name, or an address is invalid.
+        NotFoundError: a folder contains no authority.
     """
     for address in addresses:
         try:
@@ -68,12 +68,12 @@ def make_router(
 
 
 def router_session(place: Path, port: int, fleet: dict[str, tuple[str, ...]]) -> dict[str, Any]:
-    """Zenoh's configuration of the router.
+    """Return Zenoh's configuration of the router.
 
     Args:
-        place: place of its files.
-        port: where it listens.
-        fleet: common names of the stations that each robot knows, by its name.
+        place: folder of its files.
+        port: its port.
+        fleet: common names of the stations known to each robot, by its name.
     """
     return {
         "mode": "router",

@@ -1,4 +1,4 @@
-"""The true robot of a twin, as its configuration describes it: body, mounts, servos, motor, pack."""
+"""The true robot of a simulated twin, derived from its configuration: body, mounts, servos, motor, pack."""
 
 import math
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ S = TypeVar("S", bound=Schema)
 
 
 def as_built(world: WorldConfig, config: TruckConfig) -> WorldConfig:
-    """``world`` with the robot of ``config`` wherever it states nothing itself."""
+    """Return ``world`` with the robot of ``config`` wherever it sets nothing itself."""
     geometry, devices = config.geometry, config.devices
     lengths = ("wheelbase", "track", "wheel_radius", "length", "width", "mass")
     truck = {name: getattr(geometry, name) for name in lengths} | {"body": config.body} | _servos(config)
@@ -30,7 +30,7 @@ def as_built(world: WorldConfig, config: TruckConfig) -> WorldConfig:
 
 
 def _below(settings: S, found: Mapping[str, Any], *, stated: bool = True) -> S:
-    """The settings, with what was found for those that are not stated; none are in a section that is not stated."""
+    """Return the settings, with derived values for those not set; a section that is not set gets all of them."""
     data = dict(settings)
     for name, value in found.items():
         inner, given = data.get(name), stated and name in settings.model_fields_set
@@ -47,7 +47,7 @@ def _place(mount: Mount) -> dict[str, float]:
 
 
 def _servos(config: TruckConfig) -> dict[str, Any]:
-    """Servos of the axles, as the controller's settings have them."""
+    """Return the servos of the axles by the controller's settings."""
     steering = config.devices.steers()
     if steering is None:
         return {}
@@ -77,7 +77,7 @@ def _servos(config: TruckConfig) -> dict[str, Any]:
 
 
 def _motor(config: TruckConfig) -> dict[str, Any]:
-    """A motor that reaches its greatest rate and the body's pull on the configured pack."""
+    """Return a motor that reaches its maximum rate and the body's pull with the configured pack."""
     geometry = config.geometry
     shafts = config.devices.shafts()
     found: dict[str, Any] = {"ratio": geometry.drive_ratio, "clutch_force": geometry.pull}

@@ -48,7 +48,7 @@ class SimulatedTruckConfig(TruckConfig):
 
 
 def load_simulated(path: Path) -> SimulatedTruckConfig:
-    """The configuration of a simulated robot, without calibration.
+    """Return the configuration of a simulated robot, without calibration.
 
     Raises:
         ConfigError: one line per mistake; or it describes a real robot.
@@ -60,7 +60,7 @@ def load_simulated(path: Path) -> SimulatedTruckConfig:
 
 
 def load_robot(path: Path) -> tuple[TruckConfig, Tree]:
-    """The calibrated configuration of a real or a simulated robot; of the latter the section ``sim`` is checked, too.
+    """Return the calibrated configuration of a robot; of a simulated one the section ``sim`` is checked, too.
 
     Raises:
         ConfigError: one line per mistake, in the file or in its calibration.
@@ -76,7 +76,7 @@ def needs_computer(config: SimulatedTruckConfig) -> bool:
 
 
 def with_overlay(config: SimulatedTruckConfig, overlay: Mapping[str, Any]) -> SimulatedTruckConfig:
-    """``config`` with some values replaced."""
+    """Return ``config`` with some values replaced."""
     return SimulatedTruckConfig.model_validate(_merged(config.model_dump(), overlay))
 
 

@@ -18,15 +18,15 @@ from monstertruck_sim.world.world import World
 
 @contextmanager
 def claimed(*links: Path) -> Iterator[None]:
-    """Keep the names of links for this program while the context lasts; their folders are made.
+    """Reserve the names of links for this program while the context is open; their folders are created.
 
     The user's folder, for ports without a configured name, is closed to others.
 
     Raises:
-        NotPermittedError: this user may not make a link there, or others may in the folder of this user's own.
+        NotPermittedError: this user may not create a link there, or others may in this user's own folder.
         BusyError: another program serves one of them.
-        InputError: something else than a link has the name.
-        OSError: a link cannot be made there.
+        InputError: the name belongs to something other than a link.
+        OSError: a link cannot be created there.
     """
     with ExitStack() as stack:
         try:
@@ -46,13 +46,13 @@ def claimed(*links: Path) -> Iterator[None]:
 
 @asynccontextmanager
 async def emulate_device(device: str, link: Path | tuple[str, int], clock: Clock, seed: int) -> AsyncIterator[Emulated]:
-    """Serve ``device`` (kind or role) behind a symlink, or at an address and TCP port, while the context lasts.
+    """Serve ``device`` (kind or role) behind a symlink, or at an address and TCP port, while the context is open.
 
     Raises:
         InputError: unknown device, one without a port, or the name exists and is not a link.
-        NotPermittedError: this user may not make it there.
+        NotPermittedError: this user may not create it there.
         BusyError: another program serves ``link``.
-        OSError: it cannot be made.
+        OSError: it cannot be created.
     """
     kind = DEVICES.named(device)
     if kind.opens == "computer":

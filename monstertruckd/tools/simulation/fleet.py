@@ -1,4 +1,4 @@
-"""Several robots in one simulated world: what their configurations have to share, and what each needs for itself."""
+"""Several robots in one simulated world: shared and individual parts of their configurations."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -15,12 +15,12 @@ SHARED: Final = ("map", "engine", "rough", "ground", "height_image", "mjcf")
 
 
 def as_fleet(configs: Sequence[SimulatedTruckConfig]) -> list[SimulatedTruckConfig]:
-    """Configurations of robots of one world, each with its own noise.
+    """Return configurations of robots of one world, each with its own noise.
 
     Map, engine, ground, people and seed of the world come from the first one.
 
     Raises:
-        InputError: two of them claim the same thing, or describe different worlds; the text names both.
+        InputError: two of them claim the same resource, or describe different worlds; the text names both.
     """
     first = configs[0]
     for config in configs[1:]:
@@ -44,7 +44,7 @@ def as_fleet(configs: Sequence[SimulatedTruckConfig]) -> list[SimulatedTruckConf
 
 
 def shared_scene(configs: Sequence[SimulatedTruckConfig]) -> Surroundings:
-    """The world of a fleet, without its robots."""
+    """Return the world of a fleet, without its robots."""
     first, *others = (config.sim for config in configs)
     return make_scene(first.world, first.seed, [other.world for other in others])
 
@@ -55,7 +55,7 @@ def _ports(config: SimulatedTruckConfig) -> Iterator[str]:
 
 
 def _machines(config: SimulatedTruckConfig) -> Iterator[Path]:
-    """The link to the emulated computer, where the daemon needs one."""
+    """Yield the link to the emulated computer if the daemon needs one."""
     if needs_computer(config):
         yield config.machine
 

@@ -49,7 +49,7 @@ class LocalOperator(Operator):
         return await self._daemon.rpc.call(rpc, payload or {})
 
     async def order(self, order: Order, *, hold: bool = False, calibrates: bool = False) -> GateState:
-        """Give an order as ``TruckClient.order`` does."""
+        """Send an order as ``TruckClient.order`` does."""
         if order in UNCONDITIONAL:
             request = ControlRequest.model_validate_json(json.dumps({**await self.header(), "order": order}))
             self._daemon.bus.inject(topics.REQ_CONTROL, request)
@@ -62,7 +62,7 @@ class LocalOperator(Operator):
         self._daemon.bus.inject(topics.REQ_DRIVE, request)
 
     async def header(self, lease: float = 1.0) -> dict[str, Any]:
-        """The header of the next request, once the gate has published its nonce."""
+        """Return the header of the next request, once the gate has published its nonce."""
         while self._gate.latest is None:
             await self._gate.next()
         self._seq += 1
@@ -99,7 +99,7 @@ class Lap:
 
     @property
     def seconds(self) -> float:
-        """Duration."""
+        """Duration, s."""
         return (self.end - self.start) / SECOND
 
     @property
@@ -109,13 +109,13 @@ class Lap:
 
 
 async def drive_lap(operator: Operator, clock: Clock, *, timeout: float = 30.0, limit: float = 600.0) -> Lap:
-    """Arm the truck, watch the tracker drive its path to the end, disarm; after a stop that disarms it, arm it again.
+    """Arm the truck, let the tracker drive its path to the end, disarm; after a stop that disarms it, arm it again.
 
     Args:
-        operator: gives the orders.
-        clock: time.
-        timeout: seconds to wait until the truck can be armed.
-        limit: seconds the path may take.
+        operator: sends the orders.
+        clock: source of time.
+        timeout: maximum time until the truck can be armed, s.
+        limit: maximum time of the path, s.
 
     Raises:
         NoAnswerError: the truck could not be armed, or the path took too long; the text gives the reason.
@@ -161,7 +161,7 @@ async def drive_lap(operator: Operator, clock: Clock, *, timeout: float = 30.0, 
 
 
 async def _text_of(outcome: Reason, events: Mailbox[Event], clock: Clock) -> str:
-    """Text of the tracker's event on the end of a path, which may come a moment after its state."""
+    """Return the text of the tracker's event on the end of a path, which may follow its state."""
     if outcome is Reason.GOAL_REACHED:
         return ""
     with suppress(TimeoutError):

@@ -1,4 +1,4 @@
-"""Other commands of this program as processes, for those that need several at once."""
+"""Other commands of this program as processes."""
 
 import asyncio
 import signal
@@ -10,7 +10,7 @@ from pathlib import Path
 
 @asynccontextmanager
 async def program(output: Path | None, *arguments: str) -> AsyncIterator[asyncio.subprocess.Process]:
-    """Run ``monstertruckd arguments`` while the context lasts; SIGTERM ends it.
+    """Run ``monstertruckd arguments`` while the context is open; SIGTERM ends it.
 
     Args:
         output: file for its output; None for this program's output.

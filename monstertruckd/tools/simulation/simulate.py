@@ -1,4 +1,4 @@
-"""``monstertruckd simulate``: emulated robots as a process, their devices behind ptys."""
+"""``monstertruckd simulate``: emulated robots in one process, with their devices behind ptys."""
 
 import asyncio
 import math
@@ -54,11 +54,11 @@ MOST_POSTS: Final = 50
 
 
 class EmulatedRoom:
-    """Posts in a world, which the robot's sensors see and which stop it.
+    """Posts in a world, seen by the robot's sensors; they stop it on contact.
 
     Args:
-        world: with the robot.
-        clock: time.
+        world: world with the robot.
+        clock: source of time.
         body: length and width of the robot, m.
     """
 
@@ -67,10 +67,10 @@ class EmulatedRoom:
         self._posts: list[Disc] = []
 
     def command(self, words: list[str]) -> None:
-        """Put a post or remove all.
+        """Add a post, or remove all.
 
         Raises:
-            InputError: other words, a place where the robot stands, or too many posts.
+            InputError: unknown words, a place occupied by the robot, or too many posts.
         """
         now = self._clock.now()
         match words:
@@ -119,7 +119,7 @@ class TruthLog:
             await self._clock.sleep_until(due)
 
     def array(self) -> Array:
-        """Shape (n, 6): ``COLUMNS``, s, m, m, rad, m/s, 0 or 1."""
+        """Return the samples, (n, 6): ``COLUMNS``, s, m, m, rad, m/s, 0 or 1."""
         return np.array(self._samples).reshape(-1, len(self.COLUMNS))
 
 
@@ -133,27 +133,26 @@ async def serve(
 ) -> int:
     """Serve the devices of robots in one world behind ptys at their configured ports until SIGTERM or SIGINT.
 
-    Faults are read from standard input, each line beginning with the device's role, the monitor's name, or ``usb``, and
-    ``tape`` measures; with several robots the robot's name stands before it.
+    Faults are read from standard input. Each line begins with the device's role, the monitor's name, or ``usb``;
+    ``tape`` measures. With several robots the robot's name precedes it.
 
     Args:
-        clock: time.
+        clock: source of time.
         configs: the robots; of several ``as_fleet`` has made sure that they can share a world.
-        say: gets a line for the terminal: answers to commands, contacts, ready devices.
+        say: receives a line for the terminal: answers to commands, contacts, ready devices.
         truth: file of the true motion.
-        daemons_of: configurations of daemons that are run meanwhile: stopped before the devices go, and when all have
-            ended by themselves the devices go, too.
+        daemons_of: configurations of daemons to run meanwhile; they are stopped before the devices, and when all have
+            ended by themselves the devices are stopped, too.
         beside: runs meanwhile, with the command handler; its end ends everything.
 
     Returns:
         The exit code of the first daemon that failed by itself, else 0.
 
     Raises:
-        NotPermittedError: this user may not make a port there.
-        InputError: ``machine`` names an existing file or folder instead of a link to the emulated computer, or so does
-            a port; or two robots overlap.
+        NotPermittedError: this user may not create a port there.
+        InputError: ``machine`` or a port names an existing file or folder instead of a link; or two robots overlap.
         BusyError: another program serves one of the ports.
-        OSError: a port cannot be made.
+        OSError: a port cannot be created.
     """
     ports = (it.port for config in configs for it in config.devices.present().values())
     links = [port.path for port in ports if isinstance(port, PortConfig)]
@@ -175,7 +174,7 @@ async def serve(
 
 @contextmanager
 def _linked(config: SimulatedTruckConfig, folder: Path) -> Iterator[None]:
-    """Link ``machine`` to the folder of the emulated computer, where the daemon needs one."""
+    """Link ``machine`` to the folder of the emulated computer if the daemon needs one."""
     if not needs_computer(config):
         yield
         return
@@ -195,12 +194,12 @@ class ServedRobot:
     """One robot with its devices behind ptys.
 
     Args:
-        config: the robot.
-        clock: time.
+        config: configuration of the robot.
+        clock: source of time.
         folder: folder of its emulated computer.
-        scene: world.
-        say: gets a line for the terminal.
-        keeps_truth: whether what really happens is requested at the end; a day of it is 80 MB.
+        scene: the world.
+        say: receives a line for the terminal.
+        keeps_truth: whether to keep the true motion until the end, 80 MB a day.
     """
 
     def __init__(
@@ -246,7 +245,7 @@ class ServedRobot:
         self.console = CommandedGroup("device", emulated)
 
     def tasks(self, say: Say) -> Iterator[asyncio.Task[Any]]:
-        """Everything that runs as long as it is served; ``say`` gets lines without the robot's name."""
+        """Yield all tasks that run while it is served; ``say`` receives lines without the robot's name."""
         config, world, clock = self.config, self._robot.world, self._clock
         yield asyncio.create_task(self._robot.run(), name=config.robot)
         if self._keeps_truth:
@@ -312,13 +311,13 @@ async def _serve(
 
 
 def save_truth(file: Path, logs: Mapping[str, TruthLog]) -> None:
-    """Write what really happened, an array of each log by name."""
+    """Write the true motions, as one array for each log, by name."""
     arrays: dict[str, Any] = {name: log.array() for name, log in logs.items()}
     np.savez(file, **arrays)
 
 
 async def _last_end(programs: Sequence[asyncio.subprocess.Process], names: Sequence[str], say: Say) -> int:
-    """Wait until all daemons have ended; the first code that is none of success."""
+    """Wait until all daemons have ended; return the first exit code of a failure."""
     codes: list[int] = []
 
     async def end(process: asyncio.subprocess.Process, name: str) -> None:
@@ -331,7 +330,7 @@ async def _last_end(programs: Sequence[asyncio.subprocess.Process], names: Seque
 
 
 async def _see(clock: Clock, config: SimulatedTruckConfig, world: World) -> None:
-    """Say where the robot really is, whenever there is a daemon."""
+    """Print the true pose of the robot whenever a daemon is running."""
     endpoint = next(iter(config.zenoh.listen), DEFAULT_ENDPOINT)
     while True:
         try:

@@ -1,4 +1,4 @@
-"""Tape, string and meter for an emulated robot, for its calibration by hand."""
+"""Tape, string and meter for an emulated robot, for its manual calibration."""
 
 import math
 from collections.abc import Callable
@@ -17,13 +17,13 @@ WORDS: Final = (
 
 
 class EmulatedTape:
-    """Measures the simulated truth, for a person only: nothing is passed to the robot.
+    """Measures the simulated truth for a person; the robot receives nothing.
 
     Args:
-        world: with the robot.
-        clock: time.
+        world: world with the robot.
+        clock: source of time.
         body: length and width of the robot, m.
-        say: gets measurements, a line each.
+        say: receives measurements, one per line.
     """
 
     def __init__(self, world: World, clock: Clock, body: tuple[float, float], say: Callable[[str], None]) -> None:
@@ -48,11 +48,11 @@ class EmulatedTape:
 
 
 def measured(mark: TruthState, now: TruthState, length: float, width: float) -> str:
-    """What tape, string and meter show.
+    """Return the readings of tape, string and meter.
 
     Args:
-        mark: when mark and string were laid.
-        now: when it is measured.
+        mark: state when mark and string were laid.
+        now: state at the measurement.
         length: length of the body, m.
         width: width of the body, m.
     """
@@ -70,7 +70,7 @@ def _meter(now: TruthState) -> str:
 
 
 def _moved(mark: TruthState, now: TruthState, x: float, y: float) -> tuple[float, float]:
-    """Displacement of a place of the body, ahead and left, m; x and y from the body's middle, m."""
+    """Return the displacement of a point of the body, ahead and left, m; x and y from the body's centre, m."""
     ahead, left = to_body(mark.yaw, now.x - mark.x, now.y - mark.y)
     now_x, now_y = to_world(now.yaw - mark.yaw, x, y)
     return ahead + now_x - x, left + now_y - y

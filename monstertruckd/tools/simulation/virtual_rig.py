@@ -32,7 +32,7 @@ IN_MEMORY: Final = "/dev/shm"  # noqa: S108 - a new folder is made in it
 
 
 class VirtualRig:
-    """A whole robot in one process; everything random comes from the configuration's seed.
+    """A complete robot in one process; all random numbers derive from the configuration's seed.
 
     Args:
         config: configuration of the simulated truck.
@@ -95,7 +95,7 @@ class VirtualRig:
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator["VirtualRig"]:
-        """World, devices and daemon run while the context lasts; the daemon ends first, in order.
+        """Run world, devices and daemon while the context is open; the daemon ends first, in order.
 
         Raises:
             BaseException: error that ended the daemon early.
@@ -129,20 +129,20 @@ class VirtualRig:
     # The computer's supply
 
     async def cut(self) -> None:
-        """The daemon is gone at once; cables that lead to it must be dead before."""
+        """Remove the daemon at once; its cables must be unplugged before."""
         assert self._daemon_task is not None
         self._daemon_task.cancel()
         await asyncio.wait([self._daemon_task])
 
     def give(self) -> None:
-        """A new daemon on the same robot; subscriptions to the one before receive nothing of it."""
+        """Start a new daemon on the same robot; subscriptions to the previous one receive nothing from it."""
         self.daemon = self._new_daemon()
         self._start_daemon()
 
     # The daemon's worker processes
 
     def kill(self, name: str) -> None:
-        """End a worker as SIGKILL does, and wait until it is dead; nothing if it does not run."""
+        """Kill a worker as SIGKILL does, and wait until it is dead; no effect if it does not run."""
         pid = self.daemon.worker_pids().get(name)
         if pid is not None:
             process = os.pidfd_open(pid)
@@ -163,11 +163,11 @@ class VirtualRig:
 
     @property
     def daemon_ended(self) -> bool:
-        """Whether the daemon has ended, asked to or not."""
+        """Whether the daemon has ended."""
         return self._daemon_task is not None and self._daemon_task.done()
 
     async def end_daemon(self) -> None:
-        """Ask the daemon to end, as SIGTERM does, and wait until it has."""
+        """End the daemon as SIGTERM does, and wait until it has ended."""
         self._stop.set()
         assert self._daemon_task is not None
         if not self._daemon_task.cancelled():

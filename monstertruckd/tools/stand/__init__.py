@@ -1,1 +1,1 @@
-"""The overhead test stand: cameras over a table that say where robots are."""
+"""The overhead test stand: cameras over a table that locate robots."""

@@ -1,7 +1,7 @@
 """Estimates of a log against the stand: odometry, pose in map, tracker; and the stand's latency.
 
-An estimate's frame is laid over the stand's by least squares of the poses (rotation and shift, no scale). The latency
-is the time shift with the best agreement between the turns of odometry and stand.
+An estimate's frame is aligned with the stand's by least squares of the poses (rotation and translation, no scale). The
+latency is the time shift with the best agreement between the turns of odometry and stand.
 """
 
 from dataclasses import asdict, dataclass
@@ -23,7 +23,7 @@ LEAST_COMMON: Final = 40
 
 @dataclass(frozen=True)
 class EstimateError:
-    """An estimate against the stand."""
+    """Error of an estimate against the stand."""
 
     what: str
     poses: int
@@ -38,7 +38,7 @@ class EstimateError:
 
 
 def errors_of(log: LogReader) -> list[EstimateError]:
-    """Odometry's and the map pose's error; of a damaged log up to there.
+    """Return the errors of odometry and map pose; of a damaged log up to the damage.
 
     Raises:
         InputError: it has no poses of a stand, or none of an estimate.
@@ -64,7 +64,7 @@ def errors_of(log: LogReader) -> list[EstimateError]:
 
 
 def tracker_errors(log: LogReader) -> dict[str, float] | None:
-    """Distance from the path reported by the tracker (m); None if none drove."""
+    """Return the distance from the path as reported by the tracker (m); None if no tracker drove."""
     reports: list[Any] = [entry.decode() for entry in log if entry.topic == TRACKER.name]
     off = [abs(report.cross_track) for report in reports]
     if not off:
@@ -73,7 +73,7 @@ def tracker_errors(log: LogReader) -> dict[str, float] | None:
 
 
 def error_of(what: str, seen: Array, estimate: Array) -> EstimateError:
-    """Errors of one estimate; both (n, 4): stamp (s), x, y (m), yaw (rad)."""
+    """Return the errors of one estimate; both (n, 4): stamp (s), x, y (m), yaw (rad)."""
     latency = latency_of(seen, estimate)
     at = seen[:, 0] - (latency or 0.0)
     inside = (at >= estimate[0, 0]) & (at <= estimate[-1, 0])
@@ -95,7 +95,7 @@ def error_of(what: str, seen: Array, estimate: Array) -> EstimateError:
 
 
 def latency_of(seen: Array, estimate: Array) -> float | None:
-    """Delay of the stand's stamps (s); None: hardly any turn."""
+    """Return the delay of the stand's stamps (s); None if the robot hardly turned."""
     yaw, other = np.unwrap(seen[:, 3]), np.unwrap(estimate[:, 3])
     if np.ptp(yaw) < 0.5:  # least turn to determine the latency, rad
         return None
@@ -115,12 +115,12 @@ def latency_of(seen: Array, estimate: Array) -> float | None:
 
 
 def as_values(found: list[EstimateError]) -> list[dict[str, Any]]:
-    """Plain data."""
+    """Return plain data."""
     return [asdict(row) for row in found]
 
 
 def _laid_over(truth: Array, estimate: Array, part: slice) -> Array:
-    """The estimate in the stand's frame: mean turn, and shift, over ``part``."""
+    """Return the estimate in the stand's frame: mean turn and translation over ``part``."""
     turns = truth[part, 2] - estimate[part, 2]
     yaw = float(np.arctan2(np.sin(turns).mean(), np.cos(turns).mean()))
     c, s = np.cos(yaw), np.sin(yaw)

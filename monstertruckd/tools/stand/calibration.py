@@ -1,7 +1,7 @@
-"""Calibration of the stand: lenses by a board, places by marks on the table, all joined by what several cameras see.
+"""Calibration of the stand: lenses by a board, camera poses by marks on the table, joined by marks that several see.
 
-The marks are tags whose middles were measured by ruler. A mark that two cameras see must be at one place for both: the
-places of all cameras are fitted together, by least squares of points on the table.
+The marks are tags whose centres were measured with a ruler. A mark seen by two cameras must be at one place for both:
+the poses of all cameras are fitted together, by least squares of points on the table.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,7 +31,7 @@ LEAST_MARKS: Final = 5
 
 
 class CameraCalibration(Schema):
-    """One camera."""
+    """Calibration of one camera."""
 
     matrix: Numbers
     """3 x 3, row-major (pixels)"""
@@ -49,7 +49,7 @@ class CameraCalibration(Schema):
 
 
 class StandCalibration(Schema):
-    """All cameras of a stand."""
+    """Calibration of all cameras of a stand."""
 
     version: Literal[1] = 1
     cameras: dict[str, CameraCalibration]
@@ -57,17 +57,17 @@ class StandCalibration(Schema):
     """RMS difference between cameras of a mark that several see (m); None: no mark is seen by two"""
 
     def placed(self) -> dict[str, PlacedCamera]:
-        """For use."""
+        """Return the cameras with their poses."""
         return {name: _placed(found) for name, found in self.cameras.items()}
 
 
 def middles(sightings: Sequence[Sighting]) -> dict[int, Array]:
-    """Middle of each tag (pixels): where the diagonals cross, which perspective keeps."""
+    """Return the centre of each tag (pixels): the intersection of its diagonals, which perspective preserves."""
     return {sighting.tag: _crossing(sighting.corners) for sighting in sightings}
 
 
 def seen_marks(pictures: Sequence[Picture]) -> dict[int, Array]:
-    """Centres of tags, averaged over pictures of a still scene (pixels)."""
+    """Return the centres of tags, averaged over images of a still scene (pixels)."""
     found: dict[int, list[Array]] = {}
     for picture in pictures:
         for tag, middle in middles(TagReader(everywhere=1).read(picture)).items():
@@ -76,10 +76,10 @@ def seen_marks(pictures: Sequence[Picture]) -> dict[int, Array]:
 
 
 def place(lens: Lens, seen: Mapping[int, Array], marks: Mapping[int, MarkConfig]) -> PlacedCamera:
-    """Place of one camera from marks at known places.
+    """Return the pose of one camera from marks at known places.
 
     Raises:
-        InputError: too few of them are in sight.
+        InputError: too few of them are visible.
     """
     known = sorted(seen.keys() & marks.keys())
     if len(known) < LEAST_MARKS:
@@ -94,11 +94,11 @@ def place(lens: Lens, seen: Mapping[int, Array], marks: Mapping[int, MarkConfig]
 def check_places(
     placed: PlacedCamera, seen: Mapping[int, Array], marks: Mapping[int, MarkConfig], ruler: float
 ) -> None:
-    """Refuse a mark that is not at its given place.
+    """Reject a mark that is not at its given place.
 
     Args:
-        placed: camera, by all of its marks.
-        seen: middles of its marks (pixels).
+        placed: camera, placed by all of its marks.
+        seen: centres of its marks (pixels).
         marks: marks by tag.
         ruler: standard deviation of a mark's place (m).
 
@@ -136,11 +136,11 @@ def join(
     marks: Mapping[int, MarkConfig],
     ruler: float,
 ) -> dict[str, PlacedCamera]:
-    """All places fitted together: marks lie at their measured places, and where the other cameras see them.
+    """Fit the poses of all cameras together, by the measured places of marks and their places in the other cameras.
 
     Args:
-        cameras: placed one by one.
-        seen: middles of marks by camera (pixels).
+        cameras: cameras placed one by one.
+        seen: centres of marks by camera (pixels).
         marks: marks by tag.
         ruler: standard deviation of a mark's place (m).
     """
@@ -177,15 +177,15 @@ def join(
 def calibrate(
     config: OverheadConfig, boards: Mapping[str, Sequence[Picture]], floors: Mapping[str, Sequence[Picture]]
 ) -> StandCalibration:
-    """Lenses, places, and the join.
+    """Calibrate lenses and poses, and join them.
 
     Args:
         config: configuration of the stand.
-        boards: pictures of the board by camera.
-        floors: pictures of the table by camera.
+        boards: images of the board by camera.
+        floors: images of the table by camera.
 
     Raises:
-        InputError: a camera lacks pictures or marks, or a mark lies elsewhere; names it.
+        InputError: a camera lacks images or marks, or a mark lies elsewhere; names it.
     """
     lenses: dict[str, tuple[LensFit, int]] = {}
     seen, placed = {}, {}
@@ -225,10 +225,10 @@ def calibrate(
 
 
 def load(path: Path) -> StandCalibration:
-    """Read it.
+    """Read the calibration file.
 
     Raises:
-        ConfigError: there is none, or it is damaged.
+        ConfigError: it is missing or damaged.
     """
     expected = "a calibration of the stand (`stand calibrate` makes one)"
     with reading(path, expected, ConfigError):

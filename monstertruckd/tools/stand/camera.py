@@ -1,4 +1,4 @@
-"""Places of cameras over a plane: from pixels to points of the stand, and back. Its plane is z = 0, z upwards."""
+"""Camera poses over a plane: from pixels to points of the stand, and back. The plane is z = 0, with z upwards."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,7 +12,7 @@ from monstertruck_kinematics.elementary import Array
 
 @dataclass(frozen=True)
 class PlacedCamera:
-    """A camera over the stand."""
+    """A camera with its pose in the stand."""
 
     lens: Lens
     rotation: Array
@@ -22,25 +22,25 @@ class PlacedCamera:
 
     @cached_property
     def axes(self) -> Array:
-        """(3, 3): the camera's axes in the stand, as rows."""
+        """The camera's axes in the stand as rows, (3, 3)."""
         return rotation_matrix(self.rotation)
 
     @property
     def centre(self) -> Array:
-        """(3,): of the lens in the stand (m)."""
+        """Centre of the lens in the stand, (3,) (m)."""
         return -self.axes.T @ self.translation
 
     def on_plane(self, pixels: Array, height: float = 0.0) -> Array:
-        """Points of a level plane that pixels show (m); (n, 2) both.
+        """Return the points of a level plane seen at pixels (m); (n, 2) both.
 
         Args:
-            pixels: seen.
+            pixels: image points.
             height: height of the plane above the stand's plane (m).
         """
         return meet(self.lens.directions(pixels), self.axes, self.translation, height)
 
     def project(self, points: Array) -> Array:
-        """Pixels of points of the stand; from (n, 3) to (n, 2)."""
+        """Return the pixels of points of the stand; from (n, 3) to (n, 2)."""
         shown, _ = cv2.projectPoints(
             np.ascontiguousarray(points, dtype=np.float64),
             self.rotation,
@@ -51,24 +51,24 @@ class PlacedCamera:
         return np.asarray(shown).reshape(-1, 2)
 
     def border(self, pixels: Array) -> float:
-        """Minimum distance of pixels from the picture's border, as a fraction of its height."""
+        """Return the minimum distance of pixels from the image border, as a fraction of its height."""
         width, height = self.lens.size
         x, y = pixels[:, 0], pixels[:, 1]
         return float(min(x.min(), y.min(), (width - 1 - x).min(), (height - 1 - y).min())) / height
 
 
 def rotation_matrix(vector: Array) -> Array:
-    """Rodrigues' formula; from (3,) to (3, 3)."""
+    """Return the rotation matrix (3, 3) of a rotation vector (3,), by Rodrigues' formula."""
     return np.asarray(cv2.Rodrigues(np.asarray(vector, dtype=np.float64))[0])
 
 
 def meet(directions: Array, axes: Array, translation: Array, height: float = 0.0) -> Array:
-    """Intersections of a camera's rays with a level plane (m); (n, 2).
+    """Return the intersections of a camera's rays with a level plane (m), (n, 2).
 
     Args:
         directions: x and y at z = 1 of the camera, (n, 2).
         axes: axes of the camera in the stand, as rows, (3, 3).
-        translation: the stand's origin as the camera has it (m).
+        translation: the stand's origin in the camera's frame (m).
         height: height of the plane (m).
     """
     rays = np.column_stack((directions, np.ones(len(directions)))) @ axes

@@ -19,14 +19,14 @@ class VideoDevice(Schema):
 
 
 class FileSource(Schema):
-    """Recorded pictures: a film, or a folder of pictures in the order of their names."""
+    """Recorded images: a film, or a folder of images in the order of their names."""
 
     kind: Literal["file"] = "file"
     path: Path
 
 
 class RenderedCamera(Schema):
-    """A camera under the ceiling of a simulated world, which `simulate` renders."""
+    """A ceiling camera of a simulated world, rendered by `simulate`."""
 
     kind: Literal["rendered"] = "rendered"
     port: Path
@@ -44,14 +44,14 @@ class StandCamera(Schema):
 
 
 class MarkConfig(Schema):
-    """A tag that lies on the table for good, measured by ruler from the stand's middle (m)."""
+    """A tag fixed on the table, measured with a ruler from the stand's centre (m)."""
 
     x: float
     y: float
 
 
 class MarkedRobot(Schema):
-    """A robot that carries a marker."""
+    """A robot with a marker."""
 
     x: float = 0.0
     """Offset of the marker's centre ahead of the robot's centre (m)"""
@@ -64,13 +64,13 @@ class MarkedRobot(Schema):
 
 
 class TaggedRobot(MarkedRobot):
-    """A robot with a tag on it, whose upper edge lies towards the front."""
+    """A robot with a tag, whose upper edge points to the front."""
 
     tag: Annotated[int, Field(ge=0, le=586)]
 
 
 class BlobRobot(MarkedRobot):
-    """A robot with two coloured discs on it, one before the other."""
+    """A robot with two coloured discs, one ahead of the other."""
 
     front: Colour
     rear: Colour
@@ -87,12 +87,12 @@ class BlobRobot(MarkedRobot):
 
     @property
     def colours(self) -> frozenset[Colour]:
-        """Both."""
+        """Colours of both discs."""
         return frozenset((self.front, self.rear))
 
 
 class OverheadConfig(Schema):
-    """The stand."""
+    """Configuration of the stand."""
 
     FILE_KEYS: ClassVar[tuple[tuple[str, ...], ...]] = ()
 

@@ -1,8 +1,8 @@
-"""Identities of robots with two coloured discs, of which several may look the same.
+"""Identities of robots with two coloured discs; several robots may look the same.
 
-A front disc and a rear one at the right distance are a robot's place; it belongs to the robot that is expected next to
-it (nearest neighbour from where each would be by its speed, nearest first, no disc twice). Robots that look the same
-and were out of sight together are not guessed: one of them has to be seen at its start.
+A front disc and a rear disc at the right distance are a robot's pose. It is assigned to the robot expected nearest to
+it (by extrapolation with each robot's speed, nearest first, no disc twice). Robots that look the same and were out of
+sight together are not guessed: one of them must be seen at its start.
 """
 
 import math
@@ -47,7 +47,7 @@ class _Track:
 
 
 class Identities:
-    """Names to pairs of discs.
+    """Assigns pairs of discs to robots.
 
     Args:
         robots: robots by name.
@@ -64,12 +64,12 @@ class Identities:
         self._said: set[str] = set()
 
     def seen(self, stamp: int, camera: PlacedCamera, blobs: Sequence[Blob]) -> list[tuple[str, MarkerPose]]:
-        """Robots in one picture.
+        """Return the robots in one image.
 
         Args:
-            stamp: stamp of it (ns).
-            camera: that took it.
-            blobs: in it.
+            stamp: stamp of the image (ns).
+            camera: its camera.
+            blobs: its discs.
         """
         options = [
             (cost, name, pair)
@@ -87,7 +87,7 @@ class Identities:
         return list(found.items())
 
     def learn(self, stamp: int, name: str, pose: MarkerPose) -> None:
-        """Pose of a robot, by all cameras together."""
+        """Store the pose of a robot from all cameras together."""
         place = np.array((pose.x, pose.y))
         track = self._tracks.get(name)
         self._mistakable.discard(name)
@@ -100,7 +100,7 @@ class Identities:
             track.stamp, track.place = stamp, place
 
     def complaints(self) -> list[str]:
-        """Robots that are newly not distinguished."""
+        """Return the robots that have just become indistinguishable."""
         new = sorted(self._mistakable - self._said)
         self._said |= self._mistakable
         if not new:
@@ -111,7 +111,7 @@ class Identities:
         ]
 
     def _cost(self, name: str, stamp: int, pair: Pair) -> float | None:
-        """How far a pair is from where a robot is expected (m); None: too far."""
+        """Return the distance of a pair from the expected place of a robot (m); None if too far."""
         place = np.array((pair.pose.x, pair.pose.y))
         start = self._robots[name].start
         at_start = None if start is None else float(np.hypot(*(place - start)))
@@ -129,7 +129,7 @@ class Identities:
         return AT_START + pair.off if seconds > UNSURE and not self._alike[name] else None
 
     def _may_be_another(self, name: str, stamp: int, pair: Pair) -> bool:
-        """Whether a robot that was long out of sight could be another such robot."""
+        """Whether a robot that was out of sight for long may be another one that looks the same."""
         if self._long_gone(name, stamp) and not self._at_start(name, pair):
             others = {
                 o for o in self._alike[name] if self._long_gone(o, stamp) and self._cost(o, stamp, pair) is not None
@@ -149,7 +149,7 @@ class Identities:
 
 
 def pairs(camera: PlacedCamera, robot: BlobRobot, blobs: Sequence[Blob]) -> Iterator[Pair]:
-    """Discs that have a robot's colours and distance."""
+    """Yield the pairs of discs with a robot's colours and distance."""
     if not blobs:
         return
     pixels = np.array([blob.middle for blob in blobs])

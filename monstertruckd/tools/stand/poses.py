@@ -1,4 +1,4 @@
-"""Poses of markers in one picture, and of robots by several: tags, and pairs of coloured discs."""
+"""Poses of markers in one image, and of robots from several: tags, and pairs of coloured discs."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from monstertruckd.tools.stand.config import BlobRobot, TaggedRobot
 
 
 class MarkerPose(NamedTuple):
-    """A tag, or a pair of discs, on its plane, as one camera sees it."""
+    """A tag, or a pair of discs, on its plane, as seen by one camera."""
 
     x: float
     y: float
@@ -41,7 +41,7 @@ class RobotPose(NamedTuple):
 
 
 def tag_pose(camera: PlacedCamera, sighting: Sighting, height: float) -> MarkerPose:
-    """Pose of a level tag.
+    """Return the pose of a level tag.
 
     The tag's x axis points to its printed upper edge, the robot's front.
     """
@@ -65,13 +65,13 @@ def tag_pose(camera: PlacedCamera, sighting: Sighting, height: float) -> MarkerP
 
 
 def weight_of(camera: PlacedCamera, pixels: Array) -> float:
-    """Weight of points at these pixels, (n, 2): 1, and less near the picture's border."""
+    """Return the weight of points at these pixels, (n, 2): 1, and less near the image border."""
     # 0.12: share of a picture's height: nearer to its border a sighting has less weight
     return min(max(camera.border(pixels) / 0.12, 0.0), 1.0) + 1e-3  # least weight
 
 
 def merged(poses: Sequence[MarkerPose]) -> MarkerPose:
-    """Weighted mean of what several cameras see of one marker."""
+    """Return the weighted mean of several cameras' poses of one marker."""
     weights = np.array([pose.weight for pose in poses])
     weights /= weights.sum()
     x, y, side = (float(weights @ [getattr(pose, name) for pose in poses]) for name in ("x", "y", "side"))
@@ -86,7 +86,7 @@ def merged(poses: Sequence[MarkerPose]) -> MarkerPose:
 def robot_pose(
     name: str, robot: TaggedRobot | BlobRobot, stamp: int, tag: MarkerPose, cameras: tuple[str, ...]
 ) -> RobotPose:
-    """Pose of a robot from its marker."""
+    """Return the pose of a robot from its marker."""
     yaw = math.remainder(tag.yaw - robot.yaw, math.tau)
     c, s = math.cos(yaw), math.sin(yaw)
     x, y = tag.x - c * robot.x + s * robot.y, tag.y - s * robot.x - c * robot.y

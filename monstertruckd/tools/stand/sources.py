@@ -1,4 +1,4 @@
-"""Sources of pictures: cameras of the computer, films, folders of pictures."""
+"""Sources of images: cameras of the computer, films, folders of images."""
 
 import asyncio
 import queue
@@ -29,10 +29,10 @@ FLAGS: Final = {False: cv2.IMREAD_GRAYSCALE, True: cv2.IMREAD_COLOR}
 
 
 def pictures_in(folder: Path) -> list[Picture]:
-    """All pictures of a folder in the order of their names, grey.
+    """Return all images of a folder in the order of their names, grey.
 
     Raises:
-        InputError: there is none, or one cannot be read.
+        InputError: there are none, or one cannot be read.
     """
     return [_read(path, colour=False) for path in _files(folder)]
 
@@ -47,11 +47,11 @@ def _files(folder: Path) -> list[Path]:
 def stream(
     source: VideoDevice | FileSource | RenderedCamera, size: tuple[int, int], rate: float, *, colour: bool = False
 ) -> Iterator[Picture]:
-    """Iterate over pictures, grey or blue, green and red; blocks for each.
+    """Iterate over images, grey or blue, green and red; blocks for each.
 
     Raises:
-        DeviceLostError: the camera is not there, or sends no more.
-        InputError: a film, or a picture, that cannot be read.
+        DeviceLostError: the camera is missing, or sends no more images.
+        InputError: a film or image cannot be read.
     """
     if isinstance(source, FileSource):
         if source.path.is_dir():
@@ -77,7 +77,7 @@ def stream(
 
 
 def _rendered(port: Path, mode: Mode, *, colour: bool) -> Iterator[Picture]:
-    """Pictures of an emulated camera; each request returns the latest."""
+    """Yield images of an emulated camera; each request returns the latest."""
     box: queue.Queue[bytes | BaseException] = queue.Queue(1)
     ended = threading.Event()
     # A separate thread reads continuously: a pty keeps 4 kB.
@@ -129,7 +129,7 @@ def _frames(name: Path, capture: cv2.VideoCapture, closed: Exception, *, colour:
 
 
 def _read(path: Path, *, colour: bool) -> Picture:
-    """Read a picture, with the library that has checked its size: OpenCV's reader trusts the lengths in the file."""
+    """Read an image with the library that has checked its size; OpenCV's reader trusts the lengths in the file."""
     with picture(path) as image:
         deep = image.mode.startswith("I")  # 16 bits in 32
         shades = np.asarray(image.convert("I" if deep else "RGB" if colour else "L"))
@@ -138,7 +138,7 @@ def _read(path: Path, *, colour: bool) -> Picture:
 
 
 def _coloured(shades: np.ndarray) -> np.ndarray:
-    """Blue, green and red of a grey picture, or of one in red, green and blue."""
+    """Convert a grey or RGB image to blue, green and red."""
     return np.repeat(shades[..., None], 3, axis=2) if shades.ndim == 2 else shades[..., ::-1]
 
 

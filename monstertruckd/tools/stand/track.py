@@ -1,4 +1,4 @@
-"""Cameras to poses: a thread for each camera reads tags and discs, the loop joins their simultaneous results."""
+"""From cameras to poses: a thread for each camera reads tags and discs, the loop joins their simultaneous results."""
 
 import asyncio
 import threading
@@ -21,13 +21,13 @@ Stream = Callable[[], Iterator[Picture]]
 
 
 class StandReader:
-    """Reads one camera's pictures.
+    """Reads one camera's images.
 
     Args:
-        marks: tags that lie on the table.
-        colours: colours of robots' discs; empty: pictures may be grey.
-        tagged: there are robots with tags; otherwise tags are read in one picture of ``EVERYWHERE``, for the marks.
-        phase: number of the camera: in each picture a different camera looks for tags everywhere.
+        marks: tags on the table.
+        colours: colours of robots' discs; empty: images may be grey.
+        tagged: whether robots have tags; otherwise tags are read in one image of ``EVERYWHERE``, for the marks.
+        phase: number of the camera: in each image a different camera searches for tags everywhere.
     """
 
     def __init__(
@@ -40,10 +40,10 @@ class StandReader:
         self._count = 0
 
     def read(self, picture: Picture, expected: Sequence[Array] = ()) -> list[Sighting | Blob]:
-        """Tags and discs in a picture, grey or blue, green and red.
+        """Return tags and discs in an image, grey or blue, green and red.
 
         Args:
-            picture: next one.
+            picture: next image.
             expected: corners of robots' tags, (4, 2) each (pixels).
         """
         found: list[Sighting | Blob] = []
@@ -61,13 +61,13 @@ class StandRun:
 
     Args:
         tracker: tracker of robots and cameras.
-        streams: pictures by camera; each call starts again.
-        rate: pictures a second.
-        clock: stamps a picture when it was read.
-        put: gets every pose.
-        say: gets faults of cameras.
-        live: a source that ends is a fault, and tried again.
-        colours: colours of robots' discs; pictures have to be in colour for any.
+        streams: images by camera; each call starts again.
+        rate: image rate (1/s).
+        clock: stamps each image when it is read.
+        put: receives every pose.
+        say: receives faults of cameras.
+        live: whether a source that ends is a fault, and retried.
+        colours: colours of robots' discs; any require colour images.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class StandRun:
             await self._play()
 
     async def _play(self) -> None:
-        """Recorded pictures: the first ones of all cameras are of one instant, and so on."""
+        """Process recorded images: the first images of all cameras are of one instant, and so on."""
         iterators = {name: stream() for name, stream in self._streams.items()}
         readers = {name: self._reader(name) for name in iterators}
 
@@ -154,7 +154,7 @@ class StandRun:
             self._ended.set()
 
     def _watch(self, loop: asyncio.AbstractEventLoop, name: str, stream: Stream) -> None:
-        """One camera, in a separate thread: OpenCV releases the interpreter while it works."""
+        """Read one camera in a separate thread: OpenCV releases the interpreter while it works."""
         said = ""
         while not self._ended.is_set():
             reader = self._reader(name)

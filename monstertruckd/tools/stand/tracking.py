@@ -1,9 +1,9 @@
-"""Poses of robots from tags in several cameras' pictures, without jumps between cameras.
+"""Poses of robots from tags in several cameras' images, without jumps between cameras.
 
 Each camera that sees a robot's tag gives a pose on the plane of the tag; they are averaged with weights that fall to
-nothing towards a picture's border, so that a robot leaves a camera's view gradually. Tags identify robots; robots with
-coloured discs are identified by their motion. A pose that no robot can have reached is dropped until it is seen
-repeatedly; so are the results of a camera that has moved.
+zero towards the image border, so that a robot leaves a camera's view gradually. Tags identify robots; robots with
+coloured discs are identified by their motion. An implausible pose is dropped until it is seen repeatedly, as are the
+results of a camera that has moved.
 """
 
 import math
@@ -39,14 +39,14 @@ class _Known:
     """Rates of x, y and yaw (m/s, rad/s)."""
 
     def at(self, stamp: int) -> Array:
-        """x, y and yaw that are expected, (3,)."""
+        """Return the expected x, y and yaw, (3,)."""
         seconds = max((stamp - self.pose.stamp) / SECOND, 0.0)
         return np.array((self.pose.x, self.pose.y, self.pose.yaw)) + seconds * self.rate
 
 
 @dataclass(slots=True)
 class CameraState:
-    """How a camera is."""
+    """State of a camera."""
 
     heard: int
     """Stamp of its latest picture (ns)."""
@@ -66,13 +66,13 @@ class CameraState:
 
 
 def shift_of(seen: Array, places: Array) -> Array:
-    """Common displacement of marks, (4,): in x, in y, by a turn and by a scale, m RMS over them.
+    """Return the common displacement of marks, (4,): in x, in y, by a turn and by a scale, m RMS over them.
 
     Errors of the ruler are independent.
 
     Args:
-        seen: where they are seen, (n, 2) (m).
-        places: where they lie, (n, 2) (m).
+        seen: their seen places, (n, 2) (m).
+        places: their given places, (n, 2) (m).
     """
     off, arms = seen - places, places - places.mean(axis=0)
     spread = math.sqrt(float(np.mean(np.sum(arms**2, axis=1))))
@@ -86,10 +86,10 @@ class StandTracker:
     """Poses of all robots, and the state of the cameras.
 
     Args:
-        cameras: placed.
-        robots: with tags, by name.
+        cameras: cameras with their poses.
+        robots: robots with tags, by name.
         marks: tags on the table, by number.
-        now: stamp of the begin (ns).
+        now: stamp of the start (ns).
         blobs: robots with coloured discs, by name.
     """
 
@@ -118,12 +118,12 @@ class StandTracker:
         pictures: Mapping[str, Sequence[Sighting | Blob]],
         taken: Mapping[str, int] = MappingProxyType({}),
     ) -> list[RobotPose]:
-        """Poses at one instant.
+        """Return the poses at one instant.
 
         Args:
-            stamp: stamp of it (ns).
-            pictures: tags and discs in the cameras' pictures.
-            taken: stamps of pictures that were taken before (ns): a robot is carried on by its speed.
+            stamp: stamp of the instant (ns).
+            pictures: tags and discs in the cameras' images.
+            taken: stamps of older images (ns): a robot's pose is extrapolated by its speed.
         """
         seen: dict[str, list[tuple[str, MarkerPose]]] = {}
         for camera, found in pictures.items():
@@ -150,7 +150,7 @@ class StandTracker:
         return poses
 
     def expected(self, stamp: int) -> dict[str, list[Array]]:
-        """Expected corners of the robots' tags at ``stamp``, ns, by camera, (4, 2) each (pixels)."""
+        """Return the expected corners of the robots' tags at ``stamp`` (ns), by camera, (4, 2) each (pixels)."""
         squares = []
         for name, robot in self._robots.items():
             known = self._known.get(name)
@@ -173,7 +173,7 @@ class StandTracker:
         return bool(self._tagged)
 
     def complaints(self, now: int) -> list[str]:
-        """New and cleared faults of cameras, and robots that are not distinguished."""
+        """Return new and cleared faults of cameras, and robots that cannot be distinguished."""
         said = self._identities.complaints()
         silent = 1.0  # maximum gap between pictures before a camera is lost, s
         for name, state in self.cameras.items():
@@ -203,7 +203,7 @@ class StandTracker:
         return said
 
     def _carried(self, name: str, pose: MarkerPose, late: int) -> MarkerPose:
-        """Place of a robot's marker ``late`` ns after it was seen."""
+        """Extrapolate the pose of a robot's marker by ``late`` ns."""
         known = self._known.get(name)
         if known is None or not late:
             return pose
@@ -236,7 +236,7 @@ class StandTracker:
         return True
 
     def _watch(self, name: str, stamp: int, sightings: Sequence[Sighting]) -> None:
-        """Marks of a camera that are not where they were when it was calibrated."""
+        """Check a camera's marks against their places at calibration."""
         state, camera = self.cameras[name], self._cameras[name]
         state.heard, state.unmarked = stamp, state.unmarked + 1
         seen = [s for s in sightings if s.tag in self.marks]
