@@ -1,4 +1,4 @@
-"""An exploration by the emulated robot: find a tag, drive home, and its figures, with the report of its log."""
+"""An exploration by the emulated robot: find a tag, drive home; its figures, and the report of its log."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -45,13 +45,13 @@ STARTING: Final = frozenset(
 async def explore_home(
     operator: Operator, clock: Clock, *, tags: bool, report: Report, timeout: float = 120.0
 ) -> TaskEnd[ExplorationState]:
-    """Arm the robot, have it explore, find a tag where it looks for ``tags``, and drive home.
+    """Arm the robot, let it explore, find a tag if it searches for ``tags``, and drive home.
 
     Args:
-        operator: gives the orders.
-        clock: time.
-        tags: end the search once one tag is in the map.
-        report: gets progress every two seconds of the robot's time.
+        operator: sends the orders.
+        clock: source of time.
+        tags: whether to end the search once one tag is on the map.
+        report: receives the progress every two seconds of the robot's time.
         timeout: maximum wait until the robot is ready (s).
 
     Raises:
@@ -92,7 +92,7 @@ async def explore_home(
 
 
 def progress(state: ExplorationState) -> str:
-    """Progress of an exploration."""
+    """Describe the progress of an exploration."""
     tags = "" if state.find is None else f", {state.found} of {state.find} tags"
     return f"{state.elapsed:5.0f} s  {state.travelled:5.1f} m  {state.known:6.1f} m^2 known{tags}  {state.phase.value}"
 
@@ -115,16 +115,16 @@ class ExplorationSummary:
 
     @property
     def outcome(self) -> Reason:
-        """How it ended."""
+        """Reason of its end."""
         return self.end.reason
 
     @property
     def text(self) -> str:
-        """How it ended, in the explorer's words."""
+        """The explorer's description of its end."""
         return self.end.text
 
     def rows(self) -> list[tuple[str, str]]:
-        """Name and value of every figure, for print."""
+        """Return name and value of every printed figure."""
         figures = self._figures()
         return [
             ("outcome", self.end.text + (", COLLIDED" if self.collided else "")),
@@ -144,7 +144,7 @@ class ExplorationSummary:
         return {name: 0.0 if self.end.state is None else getattr(self.end.state, name) for name in names}
 
     def as_json(self) -> dict[str, Any]:
-        """Everything as plain data."""
+        """Return everything as plain data."""
         return {
             "outcome": self.end.reason.value,
             "text": self.end.text,
@@ -159,12 +159,12 @@ class ExplorationSummary:
 
 
 def summarised(end: TaskEnd[ExplorationState], truth: Array, folder: Path) -> ExplorationSummary:
-    """Figures of a run whose log is in ``folder``, where its report is written; blocks for seconds.
+    """Return the figures of a run with its log in ``folder``, and write its report there; blocks for seconds.
 
     Args:
         end: end of the exploration.
         truth: shape (n, 6), as ``TruthLog.COLUMNS``.
-        folder: with ``logs`` and the saved map in ``explored``.
+        folder: contains ``logs``, and the saved map in ``explored``.
     """
     messages, size, logs = log_figures(folder)
     page = report(logs[0], folder / "report.html", None).file

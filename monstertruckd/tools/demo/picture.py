@@ -21,7 +21,7 @@ ARROWS: Final = "→↗↑↖←↙↓↘"
 
 
 class MapScreen:
-    """Picture of the map with a line below it, redrawn in place; the last one stays.
+    """Map with a line below it, redrawn in place; the last picture remains.
 
     Args:
         console: console of a terminal.
@@ -39,7 +39,7 @@ class MapScreen:
         self._live.stop()
 
     def __call__(self, line: str, grid: Grid | None, pose: Pose2D | None) -> None:
-        """Show a line of progress below the map, as soon as there is one."""
+        """Show a line of progress below the map, once there is one."""
         room = self._console.height - 2  # rows: the line, and the cursor below it
         picture = Text("") if grid is None else map_text(grid, pose, self._console.width, room)
         self._live.update(Group(picture, Text(line)), refresh=True)
@@ -51,8 +51,8 @@ def map_text(grid: Grid, pose: Pose2D | None, columns: int, rows: int) -> Text:
     Args:
         grid: the map.
         pose: pose of the robot in the map's frame; None to leave it out.
-        columns: characters there is room for.
-        rows: lines there is room for.
+        columns: available characters per line.
+        rows: available lines.
     """
     kinds = np.full((grid.height, grid.width), UNKNOWN, dtype=np.uint8)
     cells = grid.cells.reshape(grid.height, grid.width)
@@ -86,7 +86,7 @@ def map_text(grid: Grid, pose: Pose2D | None, columns: int, rows: int) -> Text:
 
 
 def reduced(kinds: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
-    """Return the greatest kind of every square of ``step`` cells; rows are filled up to an even number."""
+    """Return the largest kind in every square of ``step`` cells; rows are padded to an even number."""
     height, width = kinds.shape
     rows, columns = math.ceil(height / step), math.ceil(width / step)
     padded = np.zeros(((rows + rows % 2) * step, columns * step), dtype=np.uint8)

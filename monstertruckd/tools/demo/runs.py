@@ -44,7 +44,7 @@ def run_fast_demo(config_file: Path, folder: Path, seed: int | None, film: Path 
 
     Args:
         config_file: simulated truck's configuration.
-        folder: for log, map and outputs.
+        folder: folder for log, map and outputs.
         seed: seed of the world; None: the configuration's.
         film: GIF of the lap; engine mujoco only.
 
@@ -85,15 +85,15 @@ def run_fast_demo(config_file: Path, folder: Path, seed: int | None, film: Path 
 
 
 def run_film(config_file: Path, film: Path, seconds: float) -> None:
-    """Film a run on the virtual clock: the truck drives the path it has, or explores; people walk.
+    """Film a run on the virtual clock: the truck drives its path, or explores; people walk.
 
     Args:
         config_file: simulated truck's configuration.
-        film: GIF.
-        seconds: seconds of the run.
+        film: path of the GIF.
+        seconds: duration of the run.
 
     Raises:
-        InputError: there is nothing to film, or no place for the file.
+        InputError: there is nothing to film, or the file cannot be written.
         NotInstalledError: this computer cannot draw.
         RequestRefusedError: the truck cannot be armed.
     """
@@ -116,7 +116,7 @@ def run_film(config_file: Path, film: Path, seconds: float) -> None:
 
 @asynccontextmanager
 async def _filmed(rig: VirtualRig, clock: VirtualClock, file: Path | None) -> AsyncIterator[None]:
-    """Film the robot meanwhile."""
+    """Film the robot while the context is open."""
     if file is None:
         yield
         return
@@ -133,13 +133,13 @@ async def _filmed(rig: VirtualRig, clock: VirtualClock, file: Path | None) -> As
 
 
 def run_fast_exploration(config_file: Path, folder: Path, seed: int | None, report: Report) -> ExplorationSummary:
-    """Explore on the virtual clock, find a tag where there are tags, and drive home.
+    """Explore on the virtual clock, find a tag if there are tags, and drive home.
 
     Args:
         config_file: configuration of a simulated robot with an explorer.
-        folder: for log, map, report and outputs.
+        folder: folder for log, map, report and outputs.
         seed: seed of the world; None: the configuration's.
-        report: gets the progress.
+        report: receives the progress.
 
     Raises:
         RequestRefusedError: the exploration does not start.
@@ -160,7 +160,7 @@ def run_fast_exploration(config_file: Path, folder: Path, seed: int | None, repo
 
 
 def seeks(config: SimulatedTruckConfig) -> bool:
-    """Whether the robot looks for a tag: its world has some, and it keeps points of interest."""
+    """Whether the robot searches for a tag: its world has some, and it keeps points of interest."""
     return config.points is not None and bool(config.sim.world.tags)
 
 
@@ -185,9 +185,9 @@ async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | No
     """Drive a lap over ptys.
 
     Args:
-        clock: time.
+        clock: source of time.
         config: simulated truck's configuration.
-        folder: where configuration, log, picture and outputs of the processes go.
+        folder: folder for configuration, log, picture and outputs of the processes.
         seed: replaces the configuration's own.
         screen: whether to draw the live screen.
 
@@ -221,7 +221,7 @@ async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | No
 
 @asynccontextmanager
 async def _served(clock: Clock, config: Path, folder: Path, seed: int | None) -> AsyncIterator[TruckClient]:
-    """Emulated robot and daemon as separate processes, and a client; the truth is written at the end."""
+    """Run emulated robot and daemon as separate processes, with a client; the truth is written at the end."""
     endpoint = free_endpoint()
     overlay = write_overlay(config, folder, endpoint, seed)
     simulate = ("simulate", "--config", str(overlay), "--truth", str(folder / "truth.npz"))
@@ -279,14 +279,14 @@ def write_overlay(config: Path, folder: Path, endpoint: str, seed: int | None = 
 
 
 def free_endpoint() -> str:
-    """A loopback endpoint with a free port."""
+    """Return a loopback endpoint with a free port."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 async def connect(clock: Clock, robot: str, endpoint: str) -> TruckClient:
-    """A client, as soon as the daemon listens."""
+    """Return a client, as soon as the daemon listens."""
     try:
         async with clock.deadline(START_LIMIT):
             while True:
@@ -302,7 +302,7 @@ async def connect(clock: Clock, robot: str, endpoint: str) -> TruckClient:
 
 
 async def _appear(exists: Callable[[], bool], clock: Clock) -> None:
-    """Wait for the map, which a worker of low priority draws; without it the summary does not list it."""
+    """Wait for the map, drawn by a low-priority worker; without it the summary does not list it."""
     with contextlib.suppress(TimeoutError):
         async with clock.deadline(15.0):
             while not exists():

@@ -14,7 +14,7 @@ from monstertruckd.tools.simulation.operator import Lap
 
 
 def log_figures(folder: Path) -> tuple[dict[str, int], int, tuple[Path, ...]]:
-    """Messages by topic, bytes, and files of a run's folder."""
+    """Return messages by topic, bytes, and files of a run's folder."""
     logs = sorted((folder / "logs").glob("*.mcap"))
     messages: dict[str, int] = {}
     for log in logs:
@@ -51,7 +51,7 @@ class Summary:
 
     @property
     def text(self) -> str:
-        """Reason why the lap was given up; empty if it was driven."""
+        """Reason why the lap was aborted; empty if it was completed."""
         return self.lap.text
 
     def _driven(self) -> Array:
@@ -72,11 +72,11 @@ class Summary:
 
     @property
     def collided(self) -> bool:
-        """Whether the truck ever ran into something."""
+        """Whether the truck ever touched an obstacle."""
         return bool(self._driven()[:, 5].any())
 
     def rows(self) -> list[tuple[str, str]]:
-        """Name and value of every figure, for print."""
+        """Return name and value of every printed figure."""
         rows = [
             ("outcome", self.lap.outcome.text + (", COLLIDED" if self.collided else "")),
             ("lap time", f"{self.lap.seconds:.1f} s"),
@@ -96,14 +96,14 @@ class Summary:
         return rows + [("file", str(file)) for file in self.files]
 
     def _stops_row(self) -> list[tuple[str, str]]:
-        """Nothing, for a lap without a stop."""
+        """Return the row of the stops; empty for a lap without a stop."""
         counts = Counter(reason.text for reason in self.lap.stops)
         text = ", ".join(f"{count} x {reason}" for reason, count in counts.items())
         again = f"; armed again {self.lap.armed_again} x" if self.lap.armed_again else ""
         return [("stopped on the way", text + again)] if text else []
 
     def _busy_row(self) -> list[tuple[str, str]]:
-        """Advice for a lap with stops on a busy computer; empty for others."""
+        """Return advice for a lap with stops on a busy computer; empty for others."""
         # Minimum lateness of a busy computer, s: one control tick.
         if not (self.lap.stops and self.lateness_p99 > 0.02):
             return []
@@ -117,7 +117,7 @@ class Summary:
         return [("true closing error", f"{self.closing_error * 100:.1f} cm (goal 30 cm)")]
 
     def as_json(self) -> dict[str, object]:
-        """Everything as plain data."""
+        """Return everything as plain data."""
         return {
             "outcome": self.lap.outcome.value,
             "text": self.lap.text,

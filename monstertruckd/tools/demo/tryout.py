@@ -1,4 +1,4 @@
-"""``monstertruckd try``: an emulated robot, its daemon with mapping and planner, and the operator's page at once."""
+"""``monstertruckd try``: emulated robot, daemon with mapping and planner, and operator's page in one command."""
 
 import asyncio
 import os
@@ -37,19 +37,19 @@ def robot_file(name: Path) -> Path:
     """Return the configuration of a robot by name; ``configs/robots`` takes precedence.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: it does not exist.
     """
     own = shipped(f"configs/robots/{name}.yaml")
     return own if len(name.parts) == 1 and own.is_file() else configuration(name)
 
 
 def write_tryout(robot: Path, folder: Path, endpoint: str) -> tuple[Path, SimulatedTruckConfig]:
-    """Write a configuration that adds a person to a simulated robot, and mapping and planner where its body allows.
+    """Write a configuration that adds a person to a simulated robot, and mapping and planner if its body allows them.
 
     Args:
-        robot: its configuration.
-        folder: for the configuration, logs, state and map.
-        endpoint: where the daemon listens.
+        robot: configuration of the robot.
+        folder: folder for the configuration, logs, state and map.
+        endpoint: endpoint of the daemon.
 
     Raises:
         ConfigError: a real robot, or a mistake in its configuration.
@@ -76,7 +76,7 @@ def _included(robot: Path, more: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _additions(own: SimulatedTruckConfig, folder: Path) -> Iterator[dict[str, Any]]:
-    """Additions to a robot, most complete first: planner and mapping, mapping alone, nothing."""
+    """Yield additions to a robot, most complete first: planner and mapping, mapping alone, nothing."""
     if own.devices.lidar is not None:
         slam = {"slam": {"save": str(folder.resolve() / "explored")}}
         for steering in STEERING:
@@ -86,7 +86,7 @@ def _additions(own: SimulatedTruckConfig, folder: Path) -> Iterator[dict[str, An
 
 
 def free_port(wanted: int) -> int:
-    """Return the wanted port of the loopback interface if it is free, else another free port."""
+    """Return the wanted loopback port if it is free, otherwise another free port."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         with suppress(OSError):
@@ -96,7 +96,7 @@ def free_port(wanted: int) -> int:
 
 
 def open_page(url: str) -> bool:
-    """Open a page where this computer has a screen and a browser; whether it has."""
+    """Open a page if this computer has a screen and a browser; return whether it has."""
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         return False  # a text browser in the terminal would take the keyboard
     try:
@@ -118,12 +118,12 @@ async def run_tryout(
     """Run emulated robot, daemon and page until SIGTERM, SIGINT or the end of one of them.
 
     Args:
-        clock: time.
+        clock: source of time.
         robot: configuration of a simulated robot.
-        folder: for logs, state and map.
+        folder: folder for logs, state and map.
         port: port of the page.
-        say: gets a line for the terminal.
-        browser: whether to open the page in a browser, where there is one.
+        say: receives a line for the terminal.
+        browser: whether to open the page in a browser, if there is one.
         calibrator: the calibration wizards, for the page.
 
     Returns:

@@ -5,13 +5,13 @@ from monstertruckd.tools.doctor.context import Finding, HostContext
 
 
 async def examine(context: HostContext, *, ask_devices: bool = True) -> list[Finding]:
-    """All findings.
+    """Return all findings.
 
-    Nothing moves; nothing is changed but the latency of adapters through which devices are asked.
+    Nothing moves; only the latency of adapters is changed through which devices are queried.
 
     Args:
-        context: the computer.
-        ask_devices: whether devices that are plugged in are asked who they are.
+        context: computer to examine.
+        ask_devices: whether to query the identity of connected devices.
     """
     return [
         *software.python(context),

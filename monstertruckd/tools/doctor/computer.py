@@ -1,4 +1,4 @@
-"""Checks of the computer: clock, disk, temperature, memory, network, and who may reach the daemon."""
+"""Checks of the computer: clock, disk, temperature, memory, network, and access to the daemon."""
 
 import os
 import re
@@ -31,7 +31,7 @@ LISTEN: Final = "0A"
 
 
 def calendar(context: HostContext) -> Iterator[Finding]:
-    """Whether logs will carry the right date."""
+    """Check that logs will have the right date."""
     clock = context.computer.machine.clock
     keeper = next((name for name in DAEMONS if context.runs(name)), None)
     set_ntp = "sudo timedatectl set-ntp true"
@@ -51,7 +51,7 @@ def calendar(context: HostContext) -> Iterator[Finding]:
 
 
 def condition(context: HostContext) -> Iterator[Finding]:
-    """Disk, heat and memory, by the limits of the host monitor."""
+    """Check disk, temperature and memory, by the limits of the host monitor."""
     config = context.config
     limits = (config.monitors.host if config is not None else None) or HostHealthConfig()
     folder = context.logs()
@@ -84,7 +84,7 @@ def condition(context: HostContext) -> Iterator[Finding]:
 
 
 def link(context: HostContext) -> Iterator[Finding]:
-    """The network, chosen and rated as by the link monitor."""
+    """Check the network, chosen and rated as by the link monitor."""
     config = context.config
     wanted = (config.monitors.link if config is not None else None) or LinkQualityConfig()
     chosen = choose(read_interfaces(context.computer.root), wanted.interface)
@@ -101,7 +101,7 @@ def link(context: HostContext) -> Iterator[Finding]:
 
 
 def wireless(context: HostContext) -> Iterator[Finding]:
-    """Networks that the computer joins by itself without a key, or with one of WEP; only of files that can be read."""
+    """Find networks that the computer joins by itself without a key or with WEP, in readable files only."""
     found: dict[str, str] = {}
     for file in sorted(context.at(NETWORKS).glob("*.nmconnection")):
         text = text_of(file) or ""
@@ -119,7 +119,7 @@ def wireless(context: HostContext) -> Iterator[Finding]:
 
 
 def _security(text: str, weak: str, keyed: str) -> str:
-    """Fault of a network's protection; empty if none."""
+    """Return the fault of a network's protection; empty if there is none."""
     plain = text.replace(" ", "")
     if weak in plain:
         return "WEP"
@@ -127,7 +127,7 @@ def _security(text: str, weak: str, keyed: str) -> str:
 
 
 def card(context: HostContext) -> Iterator[Finding]:
-    """Wear of eMMC storage, if it reports it (JEDEC: tenths of its life; 2 and 3: end of life near)."""
+    """Check the wear of eMMC storage, if reported (JEDEC: tenths of its life; 2 and 3: end of life near)."""
     for folder in sorted((context.computer.root / "sys/block").glob("mmcblk*")):
         life = (text_of(folder / "device/life_time") or "").split()
         end = text_of(folder / "device/pre_eol_info") or ""
@@ -146,7 +146,7 @@ def card(context: HostContext) -> Iterator[Finding]:
 
 
 def access(context: HostContext) -> Iterator[Finding]:
-    """Endpoints, certificates, whose requests arrive, and whether another process has a port."""
+    """Check endpoints, certificates, admitted sources, and other processes on a port."""
     if context.config is None:
         return
     zenoh = context.config.zenoh
@@ -195,7 +195,7 @@ def _file(context: HostContext, file: Path, *, private: bool) -> Iterator[Findin
 
 
 def _expiry(context: HostContext, file: Path, place: Path) -> Finding:
-    """The certificate of a file, or of the station let in by it, that expires first."""
+    """Check the certificate of a file, or the admitted station's certificate that expires first."""
     clock = context.computer.machine.clock
     now = (clock.now() + clock.real_offset()) // SECOND
     show = context.command("security", "show")
@@ -218,7 +218,7 @@ def _not_checked(context: HostContext, file: Path) -> Finding:
 
 
 def _listening(context: HostContext) -> set[int]:
-    """Local TCP ports with a listening process."""
+    """Return the local TCP ports with a listening process."""
     rows = [
         line.split()
         for name in ("tcp", "tcp6")

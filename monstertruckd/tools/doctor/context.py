@@ -40,7 +40,7 @@ class Account:
     """Names and numbers."""
 
     def may_use(self, file: Path) -> bool:
-        """Whether it may read and write the file; for a folder, whether it may put files into it."""
+        """Whether the account may read and write the file; for a folder, whether it may create files in it."""
         try:
             status = file.stat()
         except OSError:
@@ -49,7 +49,7 @@ class Account:
         return self.uid == 0 or self._allowed(status) & needed == needed
 
     def may_read(self, file: Path) -> bool:
-        """Whether it may read the file; the folders above are not checked."""
+        """Whether the account may read the file; parent folders are not checked."""
         try:
             return self.uid == 0 or bool(self._allowed(file.stat()) & 0o4)
         except OSError:
@@ -100,17 +100,17 @@ class Finding(Schema):
 
 
 def fine(check: str, seen: str, fix: str | None = None) -> Finding:
-    """A check that passed; ``fix`` may be a command that shows more."""
+    """A passed check; ``fix`` may be a command that shows more."""
     return Finding(check=check, level=Level.OK, seen=seen, fix=fix)
 
 
 def warn(check: str, reason: Reason, seen: str, fix: str | None = None) -> Finding:
-    """A check that passed with a remark."""
+    """A passed check with a warning."""
     return Finding(check=check, level=Level.WARN, reason=reason, seen=seen, fix=fix)
 
 
 def fail(check: str, reason: Reason, seen: str, fix: str | None = None) -> Finding:
-    """A check that failed."""
+    """A failed check."""
     return Finding(check=check, level=Level.FAIL, reason=reason, seen=seen, fix=fix)
 
 
@@ -119,7 +119,7 @@ SAFE_PROGRAMS: Final = ("timedatectl", "chmod", "chown", "usermod", "modprobe")
 
 
 def safe_fix(fix: str | None) -> list[str] | None:
-    """Arguments of a finding's command where it may be run unseen: no shell, no file to be named; None otherwise."""
+    """Return the arguments of a finding's command that may run without review: no shell, no file name; else None."""
     if fix is None or any(sign in fix for sign in "|&;<>$`") or "FILE" in fix:
         return None
     words = shlex.split(fix)
@@ -129,7 +129,7 @@ def safe_fix(fix: str | None) -> list[str] | None:
 
 
 def first_failure(findings: list[Finding]) -> Reason:
-    """Reason of the first failure; OK if there is none."""
+    """Return the reason of the first failure; OK if there is none."""
     return next((finding.reason for finding in findings if finding.level is Level.FAIL), Reason.OK)
 
 
@@ -164,11 +164,11 @@ class HostContext:
     versions: Callable[[str], str | None] = version_of
 
     def at(self, path: Path) -> Path:
-        """Place of an absolute path of that computer."""
+        """Return the place of an absolute path of that computer."""
         return below(self.system, path)
 
     def logs(self) -> Path:
-        """Folder of the logs; a relative one is below the service's working folder, once it is installed."""
+        """Folder of the logs; a relative one is below the installed service's working folder."""
         recorder = self.config.recorder if self.config is not None else None
         directory = Path(recorder.directory if recorder is not None else "")
         if directory.is_absolute():
@@ -188,16 +188,16 @@ class HostContext:
         return self.computer.machine.dev / found.name if found is not None else None
 
     def command(self, *arguments: str, sudo: bool = False) -> str:
-        """Command line of this program, for the user to type."""
+        """Return a command line of this program for the user."""
         return shlex.join([*(["sudo"] if sudo else []), str(self.program.python), "-m", "monstertruckd", *arguments])
 
     def install_command(self) -> str:
-        """Command that installs the service again."""
+        """Return the command that installs the service again."""
         named = ["--config", str(self.config_file)] if self.config_file is not None else ["--config", "FILE"]
         return self.command("install-service", *named, sudo=True)
 
     def find_port_command(self, role: str) -> str:
-        """Command that finds the port of a cable and writes it into the configuration."""
+        """Return the command that finds the port of a cable and writes it into the configuration."""
         return self.command("find-port", role, "--write", str(self.config_file))
 
     def daemon(self) -> int | None:
@@ -214,14 +214,14 @@ class HostContext:
 
 
 def inspect(system: Path, program: Program, config_file: Path | None, uid: int, clock: Clock) -> HostContext:
-    """The context of a computer.
+    """Return the context of a computer.
 
     Args:
         system: folder with its files; "/" is the real one.
-        program: this one.
-        config_file: named by the user; None: the one the service is started with.
+        program: this program.
+        config_file: named by the user; None: the service's.
         uid: user id of the caller.
-        clock: time.
+        clock: source of time.
     """
     unit = text_of(below(system, UNIT)) or ""
     file = config_file or installed_config(system)

@@ -1,4 +1,4 @@
-"""Checks of the devices: plugged in as configured, and answering."""
+"""Checks of the devices: whether they are connected as configured, and answer."""
 
 import asyncio
 import shutil
@@ -27,7 +27,7 @@ SUPPLY: Final = "the devices there draw too much current, or the cable is damage
 
 
 def wiring(context: HostContext) -> Iterator[Finding]:
-    """Every configured device: its port, latency and power saving."""
+    """Check every configured device: its port, latency and power saving."""
     if context.config is None:
         return
     sysfs = context.computer.machine.sysfs
@@ -96,7 +96,7 @@ def _by_hub(
 
 
 def _holder(context: HostContext, device: UsbDevice) -> str:
-    """Command that gets rid of, or shows, the program that holds a device through usbfs."""
+    """Return the command that ends, or shows, the program that holds a device through usbfs."""
     if context.runs("brltty"):
         return "sudo apt-get remove brltty"
     return f"sudo fuser -v /dev/bus/usb/{int(device.name.partition('-')[0]):03d}/{device.devnum:03d}"
@@ -128,7 +128,7 @@ def _settings(role: str, port: UsbPortConfig, device: UsbDevice, node: Node) -> 
 
 
 async def handshakes(context: HostContext) -> AsyncIterator[Finding]:
-    """Return one finding per connected device; all are queried in parallel."""
+    """Yield one finding for each connected device; all are queried in parallel."""
     if context.config is None:
         return
     daemon = context.daemon()

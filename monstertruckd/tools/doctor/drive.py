@@ -1,4 +1,4 @@
-"""Drives of 20 cm there and back, to both sides, where allowed: sensors, motor and steering with a wrong sign show.
+"""Drives of 20 cm there and back, to both sides where possible, which reveal sensors, motor and steering of wrong sign.
 
 Motor and steering give distance and turn of the robot; the lidar's scans, compass and IMU each measure them
 independently. A single sensor that disagrees with the motor and the others has the wrong sign; if all disagree, the
@@ -36,7 +36,7 @@ Drives = Callable[[MoveStep], Awaitable[MoveRecord]]
 
 @dataclass(frozen=True, slots=True)
 class Movement:
-    """One move, as each source measured it."""
+    """One move, as measured by each source."""
 
     distance: float
     """Distance by the motor, m, negative backwards"""
@@ -49,12 +49,12 @@ class Movement:
 
 
 async def signs(drives: Drives, config: TruckConfig, command: Callable[..., str]) -> list[Finding]:
-    """Drive, and compare.
+    """Drive, and compare the signs.
 
     Args:
-        drives: moves the robot as an operator; raises where the gate refuses.
+        drives: moves the robot as an operator; raises if the gate refuses.
         config: configuration of the daemon.
-        command: command of this installation.
+        command: returns a command line of this installation.
     """
     chassis = config.chassis()
     if not isinstance(chassis, TruckChassis):
@@ -78,12 +78,12 @@ async def signs(drives: Drives, config: TruckConfig, command: Callable[..., str]
 
 
 def movement(record: MoveRecord, chassis: TruckChassis, lidar: Array | None) -> Movement:
-    """Measures of a move.
+    """Return the measurements of a move.
 
     Args:
-        record: with scans and IMU, where there are.
+        record: with scans and IMU, if present.
         chassis: chassis of the robot.
-        lidar: its mount, m and rad, or None.
+        lidar: mount of the lidar (m and rad), or None.
     """
     distance, turn = by_wheels(record, chassis)
     seen: dict[str, float] = {}
@@ -103,7 +103,7 @@ def movement(record: MoveRecord, chassis: TruckChassis, lidar: Array | None) -> 
 
 
 def by_wheels(record: MoveRecord, chassis: TruckChassis) -> tuple[float, float]:
-    """Distance (m) and turn (rad) by motor and steering."""
+    """Return distance (m) and turn (rad) by motor and steering."""
     motor, front, rear = record.steps()
     distance = turn = 0.0
     for step, servos in zip(motor.tolist(), zip(front.tolist(), rear.tolist(), strict=True), strict=True):
@@ -115,10 +115,10 @@ def by_wheels(record: MoveRecord, chassis: TruckChassis) -> tuple[float, float]:
 
 
 def by_lidar(record: MoveRecord, wheels: tuple[float, float], mount: Array) -> Array | None:
-    """Motion of the body by the scans at rest before and after, m and rad, (3,); None where they do not match.
+    """Return the motion of the body by the scans at rest before and after, (3,) (m and rad); None if they do not match.
 
-    The wheels give one guess, reversed motion or turns the others. If the scans do not determine the motion, as in a
-    corridor without a visible end, x and y are NaN.
+    The wheels give one initial guess, reversed motions and turns the others. If the scans do not determine the motion,
+    as in a corridor without a visible end, x and y are NaN.
     """
     try:
         before, after = (resting_scan(found) for found in record.at_rest(topics.SCAN))
@@ -142,7 +142,7 @@ def by_lidar(record: MoveRecord, wheels: tuple[float, float], mount: Array) -> A
 
 
 def judged(moves: list[Movement], command: Callable[..., str]) -> Iterator[Finding]:
-    """Findings of all moves together: turns and distances of a move back count with their signs."""
+    """Yield the findings of all moves together: turns and distances of a move back count with their signs."""
     turn = sum(abs(move.turn) for move in moves)
     if turn < 0.1:  # minimum turn of all moves together to judge a sign, rad
         text = (
@@ -186,9 +186,9 @@ def judged(moves: list[Movement], command: Callable[..., str]) -> Iterator[Findi
 
 
 def shares_of_turn(moves: Sequence[Movement]) -> dict[str, float]:
-    """Return each sensor's share of the turn by motor and steering: 1 for all of it, negative for the opposite way.
+    """Return each sensor's share of the turn by motor and steering: 1 for all of it, negative for the opposite sign.
 
-    Wheels that are off centre turn the robot by so much a metre, to whichever side they are steered: that is left out.
+    Off-centre wheels add a constant turn per metre, independent of the steering; it is removed.
     """
     found = {}
     for name in ("compass", "IMU", "lidar"):
@@ -200,7 +200,7 @@ def shares_of_turn(moves: Sequence[Movement]) -> dict[str, float]:
 
 
 def _turns(shares: Mapping[str, float], against: Sequence[str], agree: Sequence[str]) -> Iterator[Finding]:
-    """Findings about sensors that turned with motor and steering, against them, or hardly."""
+    """Yield findings about sensors that turned with motor and steering, against them, or hardly."""
     for name, share in shares.items():
         if name in against:
             seen = f"it turns opposite to the steering and the {', '.join(agree)}: it is mounted upside down"

@@ -1,4 +1,4 @@
-"""Checks of the robot's own files: its calibration, and its latest log."""
+"""Checks of the robot's own files: its calibration and its latest log."""
 
 import math
 from collections import Counter
@@ -35,7 +35,7 @@ COUNTED: Final = {
 
 
 def calibration(context: HostContext) -> Iterator[Finding]:
-    """How well and how long ago each wizard's values were measured."""
+    """Check quality and age of each wizard's values."""
     config = context.config
     if config is None:
         return
@@ -75,7 +75,7 @@ def calibration(context: HostContext) -> Iterator[Finding]:
 
 
 def newest_log(context: HostContext) -> Iterator[Finding]:
-    """Findings of the latest log about supply, clocks, steering and signs of sensors."""
+    """Check supply, clocks, steering and signs of sensors in the latest log."""
     newest = max(context.logs().glob("*.mcap"), key=lambda path: path.stat().st_mtime, default=None)
     if newest is None or newest.stat().st_size > 200_000_000:  # longer logs are left to `log report`
         return
@@ -86,10 +86,10 @@ def newest_log(context: HostContext) -> Iterator[Finding]:
 
 
 def log_findings(path: Path) -> Iterator[Finding]:
-    """Findings of one log.
+    """Yield the findings of one log.
 
     Raises:
-        InputError: it is none.
+        InputError: it is not a log.
     """
     events: Counter[Reason] = Counter()
     series: dict[str, list[tuple[float, float]]] = {topic.name: [] for topic in (COMPASS, ODOMETRY, IMU)}
@@ -117,7 +117,7 @@ def log_findings(path: Path) -> Iterator[Finding]:
 
 
 def _saturated(angles: list[tuple[float, float]], log: str) -> Iterator[Finding]:
-    """Steering that stood at its greatest angle for much of the drive: a small limit, or wheels off centre."""
+    """Find steering at its limit for much of the drive: a small limit, or wheels off centre."""
     if len(angles) < 100:
         return
     for axle, column in zip(("front", "rear"), np.abs(np.array(angles)).T, strict=True):
@@ -130,7 +130,7 @@ def _saturated(angles: list[tuple[float, float]], log: str) -> Iterator[Finding]
 
 
 def _signs(series: dict[str, Any], log: str) -> Iterator[Finding]:
-    """Turns by compass, IMU and wheels in opposite directions."""
+    """Find turns by compass, IMU and wheels in opposite directions."""
     if ODOMETRY.name not in series:
         return
     wheels = series[ODOMETRY.name]

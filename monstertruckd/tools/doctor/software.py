@@ -23,7 +23,7 @@ NEEDED = "robot"
 
 
 def python(context: HostContext, machine: str = platform.machine()) -> Iterator[Finding]:
-    """The interpreter and the processor."""
+    """Check the interpreter and the processor."""
     version = ".".join(map(str, sys.version_info[:3]))
     seen = f"{version} on {machine}, {context.program.python}"
     if machine in MACHINES:
@@ -34,7 +34,7 @@ def python(context: HostContext, machine: str = platform.machine()) -> Iterator[
 
 
 def packages(context: HostContext, requirements: list[str] | None = None) -> Iterator[Finding]:
-    """Packages of every extra; those that a robot needs must be installed."""
+    """Check the packages of every extra; those that a robot needs must be installed."""
     if requirements is None:
         requirements = metadata.requires(DISTRIBUTION) or []
     missing = _missing(context, requirements)
@@ -56,7 +56,7 @@ def packages(context: HostContext, requirements: list[str] | None = None) -> Ite
 
 
 def configuration(context: HostContext) -> Iterator[Finding]:
-    """Whether there is one, and it is accepted."""
+    """Check that a valid configuration exists."""
     file = context.config_file
     if file is None:
         seen = "no configuration given or installed: devices were not checked"
@@ -71,7 +71,7 @@ def configuration(context: HostContext) -> Iterator[Finding]:
 
 
 def motion(context: HostContext) -> Iterator[Finding]:
-    """Which independent sensors measure the robot's motion, and which are missing to reveal a false one."""
+    """List the independent measures of the robot's motion, and the missing ones that could reveal a wrong one."""
     config = context.config
     if config is None or config.missing_actuators() is not None:
         return
@@ -104,7 +104,7 @@ def motion(context: HostContext) -> Iterator[Finding]:
 
 
 def contact(context: HostContext) -> Iterator[Finding]:
-    """Which measures show that an obstacle holds the robot, or the force and speed at which it pushes."""
+    """List the measures that reveal a contact, or the force and speed of a push without one."""
     config = context.config
     if config is None or config.missing_actuators() is not None:
         return
@@ -125,7 +125,7 @@ def contact(context: HostContext) -> Iterator[Finding]:
 
 
 def sensors(context: HostContext) -> Iterator[Finding]:
-    """Sensors that the gate waits for although the configuration has none: the robot could never be armed."""
+    """Find sensors that the gate requires but the configuration lacks: the robot could never be armed."""
     config = context.config
     if config is None or config.missing_actuators() is not None:
         return
@@ -139,7 +139,7 @@ def sensors(context: HostContext) -> Iterator[Finding]:
 
 
 def _missing(context: HostContext, requirements: list[str]) -> dict[str, list[Requirement]]:
-    """Absent distributions by extra; "" = needed always."""
+    """Return missing distributions by extra; "": always required."""
     missing: dict[str, list[Requirement]] = {}
     for row in map(Requirement.parse, requirements):
         if row.name == DISTRIBUTION:
@@ -158,7 +158,7 @@ def _install_command(context: HostContext, lacking: Sequence[Requirement]) -> st
 
 
 async def service(context: HostContext) -> AsyncIterator[Finding]:
-    """Whether the service is installed, up to date and running."""
+    """Check that the service is installed, up to date and running."""
     if not context.at(UNIT).is_file():
         seen = "not installed: the daemon is not started at boot, and the robot is not stopped when it dies"
         yield warn("service", Reason.NOT_INSTALLED, seen, context.install_command())
@@ -180,7 +180,7 @@ async def service(context: HostContext) -> AsyncIterator[Finding]:
 
 
 def rules(context: HostContext) -> Iterator[Finding]:
-    """The udev rules, and ModemManager, which sends AT commands to serial ports that no rule excludes."""
+    """Check the udev rules, and ModemManager, which sends AT commands to serial ports that no rule excludes."""
     installed = context.at(RULES).is_file()
     if not installed:
         seen = f"{RULES} is missing: no /dev/truck, no low latency, no rights"
@@ -199,7 +199,7 @@ def rules(context: HostContext) -> Iterator[Finding]:
 
 
 def rights(context: HostContext) -> Iterator[Finding]:
-    """Rights of the daemon's user: groups, device nodes, the folder of the logs."""
+    """Check the rights of the daemon's user: groups, device nodes, the folder of the logs."""
     account = context.account
     if account is None:
         seen = "the service's user does not exist"
@@ -230,7 +230,7 @@ def rights(context: HostContext) -> Iterator[Finding]:
 
 
 def _stale(context: HostContext) -> list[Path]:
-    """Installed files that differ from what would be installed now; none without a usable configuration."""
+    """Return installed files that differ from a new installation's; none without a valid configuration."""
     user = context.account.name if context.account is not None else USER
     try:
         planned = plan(context.config_file, user, context.program, context.system)

@@ -171,7 +171,7 @@ class Campaign:
         self._config = config
 
     def legs(self) -> list[DrillLeg]:
-        """The parts that can run in parallel."""
+        """Return the parts that can run in parallel."""
         config = self._config.model_dump()
         starts = range(self._first, self.count, LEG)
         return [DrillLeg(config, self.seed, start // LEG, min(LEG, self.count - start)) for start in starts]

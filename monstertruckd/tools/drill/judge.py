@@ -23,7 +23,7 @@ class WorldJudge:
 
     Args:
         world: the simulated world.
-        clock: time.
+        clock: source of time.
     """
 
     def __init__(self, world: World, clock: Clock) -> None:

@@ -1,4 +1,4 @@
-"""The legs of a drill: each one truck's share, run here or in several processes, and kept in a file."""
+"""The legs of a drill: each is one truck's share, run in this or several processes, and saved in a file."""
 
 import hashlib
 import importlib.util
@@ -23,7 +23,7 @@ Outcome = TypeVar("Outcome")
 
 
 def default_jobs() -> int:
-    """Processes of a drill: one core is left for other work."""
+    """Return the number of a drill's processes: one core is left for other work."""
     return max(len(os.sched_getaffinity(0)) - 1, 1)
 
 
@@ -41,12 +41,12 @@ class DrillLeg:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """All inputs of a drill's legs, except its seed."""
+        """Return all inputs of a drill's legs, except its seed."""
         return self.config | ({"faults": list(self.faults)} if self.faults else {})
 
 
 def truck_of_leg(config: SimulatedTruckConfig, seed: int, records: str | None) -> SimulatedTruckConfig:
-    """The robot of a leg, with its own seed and without a drill; it records to the folder ``records``, if any."""
+    """Return the robot of a leg, with its own seed and without a drill; it records to ``records``, if any."""
     keeps = config.recorder is not None and records is not None
     recorder = config.recorder.model_copy(update={"directory": records}) if config.recorder and keeps else None
     blackbox = config.blackbox if keeps else None
@@ -55,11 +55,11 @@ def truck_of_leg(config: SimulatedTruckConfig, seed: int, records: str | None) -
 
 
 class LegFile(Generic[Outcome]):
-    """Outcomes of the finished legs of a drill, one JSON object a line, so that an interrupted drill can continue.
+    """Outcomes of the finished legs of a drill, one JSON object per line, so that an interrupted drill can continue.
 
     Args:
-        path: the file; made where there is none.
-        leg: any one of the drill.
+        path: the file; created if missing.
+        leg: any leg of the drill.
         adapter: adapter of a leg's outcomes.
 
     Raises:
@@ -95,7 +95,7 @@ class LegFile(Generic[Outcome]):
         self._found[leg] = outcomes
 
     def outcomes(self, leg: DrillLeg) -> list[Outcome] | None:
-        """Outcomes of a finished leg; None if it has to be run."""
+        """Return the outcomes of a finished leg; None if it must be run."""
         return self._found.get((leg.number, leg.count))
 
     def add(self, leg: DrillLeg, outcomes: list[Outcome]) -> None:
@@ -131,7 +131,7 @@ PACKAGES: Final = (
 
 
 def _digest(config: dict[str, Any]) -> str:
-    """Hash of all inputs of a leg except seed and number: the configuration and our sources."""
+    """Return a hash of all inputs of a leg except seed and number: the configuration and our sources."""
     digest = hashlib.blake2b(repr(config).encode(), digest_size=12)
     for package in PACKAGES:
         spec = importlib.util.find_spec(package)
@@ -164,11 +164,11 @@ def run_legs(
     """Return the outcomes of all legs in the order of their numbers.
 
     Args:
-        legs: at least one.
-        step: runs one of them; a function of a module.
+        legs: at least one leg.
+        step: runs one leg; a function of a module.
         adapter: adapter of a leg's outcomes.
-        jobs: processes; 1 = this one alone.
-        resume: file of the outcomes: legs that are in it are not run again, the others are added.
+        jobs: number of processes; 1: this one alone.
+        resume: file of the outcomes: its legs are not run again, the others are added.
         report: called with the outcomes of each leg.
 
     Raises:

@@ -71,7 +71,7 @@ class WireTap:
 
     Args:
         port: port of the device.
-        clock: time.
+        clock: source of time.
     """
 
     def __init__(self, port: MemoryPort, clock: Clock) -> None:
@@ -96,7 +96,7 @@ class Received(Protocol):
 
     @property
     def to_device(self) -> Sequence[tuple[int, bytes]]:
-        """(ns, bytes)."""
+        """Received bytes: (ns, bytes)."""
 
 
 def written(tap: Received, since: int = 0) -> list[tuple[int, int, int]]:
@@ -141,8 +141,8 @@ class _EposWire(MotorWire):
     """Wire of one shaft's EPOS.
 
     Args:
-        tap: its cable.
-        shaft: index.
+        tap: tap of its cable.
+        shaft: index of the shaft.
         rpm: motor speed at 1 m/s, in the controller's sign (rpm).
     """
 
@@ -164,9 +164,9 @@ class _StepperWire(MotorWire):
     """Wire of all shafts of a body with steppers.
 
     Args:
-        tap: the controller's cable.
+        tap: tap of the controller's cable.
         config: configuration of the driver.
-        drivetrain: motor to wheel.
+        drivetrain: from motor to wheel.
     """
 
     def __init__(self, tap: WireTap, config: StepperConfig, drivetrain: DriveTrain) -> None:
@@ -191,11 +191,11 @@ class _ObeyedOrders(MotorWire):
     """Shafts of a controller with a protocol unknown here: its motor commands, read from the world.
 
     Args:
-        tap: the controller's cable.
+        tap: tap of the controller's cable.
         world: source of the motor commands.
         shafts: indices of the driven shafts.
         rpm: motor speed at 1 m/s, in the controller's sign (rpm).
-        clock: time.
+        clock: source of time.
     """
 
     def __init__(self, tap: WireTap, world: World, shafts: Sequence[int], rpm: float, clock: Clock) -> None:
@@ -250,7 +250,7 @@ class _MaestroWire:
     """Wire of a Maestro.
 
     Args:
-        tap: its cable.
+        tap: tap of its cable.
         crc: whether commands have a check sum.
         asked: called with the channel and the time (ns) of each request for a position or voltage.
     """
@@ -276,10 +276,10 @@ class _SentPulses:
     """Servo controller with a protocol unknown here: its pulses, read from the world.
 
     Args:
-        tap: its cable.
+        tap: tap of its cable.
         world: source of the pulses.
         channels: servo channels.
-        clock: time.
+        clock: source of time.
     """
 
     def __init__(self, tap: WireTap, world: World, channels: Iterable[int], clock: Clock) -> None:
@@ -325,7 +325,7 @@ Rule = Callable[[Observation], Broken]
 
 
 class Duration:
-    """Duration of a condition without a break."""
+    """Uninterrupted duration of a condition."""
 
     def __init__(self) -> None:
         self._since: int | None = None
@@ -465,7 +465,7 @@ class _Ramp:
 
 
 def _accelerations(chassis: Chassis, config: GateConfig) -> tuple[float, ...]:
-    """Maximum acceleration of each shaft within the body's limits (m/s^2)."""
+    """Return the maximum acceleration of each shaft within the body's limits (m/s^2)."""
     if len(chassis.shafts) == 1:
         return (config.acceleration,)
     if chassis.steered:  # each wheel rolls in its steered direction
@@ -515,7 +515,7 @@ class _PulsedSteering:
 
     @property
     def angles(self) -> tuple[float, ...]:
-        """Angles of the axles or wheels (rad)."""
+        """Return the angles of the axles or wheels (rad)."""
         return self.chassis.steering(*self._arms.values())
 
 
@@ -580,7 +580,7 @@ class _Turning:
         return len(seen.target) > 1 and any(map(self._world.shaft_blocked, range(len(seen.target))))
 
     def _asked(self, seen: Observation) -> float:
-        """Commanded yaw rate at the true pace (rad/s)."""
+        """Return the commanded yaw rate at the true pace (rad/s)."""
         chassis, angles = self._steering.chassis, self._steering.angles
         if len(seen.target) == 1:
             return chassis.bicycle.body_twist(seen.truth.v, *angles)[2]
@@ -590,7 +590,7 @@ class _Turning:
         return self._course[2] * min(self._pace(seen.twist) / asked, 1.0) if asked > 0 else 0.0
 
     def _pace(self, twist: Twist2) -> float:
-        """Magnitude of a motion: speed of the base, or of the wheels that turn it (m/s)."""
+        """Return the magnitude of a motion: speed of the base, or of the wheels that turn it (m/s)."""
         return max(math.hypot(*twist[:2]), abs(twist[2]) * self._steering.chassis.bicycle.track / 2)
 
 
@@ -677,7 +677,7 @@ class _Ahead:
             yield "braking", f"{truth.v:.3f} m/s with something on its way in {room:.3f} m"
 
     def _room(self, curvature: float, ahead: Array, aside: Array) -> float:
-        """Distance along the current arc to the first of these points (m)."""
+        """Return the distance along the current arc to the first of these points (m)."""
         turn = ROOM * curvature
         at_x, at_y = ROOM * np.sinc(turn / math.pi), ROOM * np.sinc(turn / 2 / math.pi) * np.sin(turn / 2)
         dx, dy = ahead - at_x[:, None], aside - at_y[:, None]
@@ -696,7 +696,7 @@ def _contact(seen: Observation) -> Broken:
 def _servo_wire(
     config: SimulatedTruckConfig, tap: WireTap, world: World, clock: Clock
 ) -> tuple[ServoWire, tuple[Rule, ...]]:
-    """Wire of the servo controller, and the rules for its other measurements."""
+    """Return the wire of the servo controller, and the rules for its other measurements."""
     assert config.devices.steering is not None
     driver, gate = config.devices.steering.driver, config.gate
     if kind_of(driver).name != MAESTRO:
@@ -715,7 +715,7 @@ class Observer:
         config: configuration of the truck, for its limits.
         world: the simulated world.
         ports: ports to tap: of the motors, and of steering, lidar and compass if present.
-        clock: time.
+        clock: source of time.
     """
 
     def __init__(
@@ -856,7 +856,7 @@ class Observer:
 
 
 def _indispensable(config: SimulatedTruckConfig, taps: Mapping[str, WireTap]) -> Iterator[tuple[str, WireTap, float]]:
-    """Wires of the devices that the truck may not drive without: role, wire and maximum silence (s).
+    """Yield the wires of the devices without which the truck may not drive: role, wire and maximum silence (s).
 
     Without the deadman line nothing stops an unreachable EPOS; stepper controllers have their own watchdog.
     """

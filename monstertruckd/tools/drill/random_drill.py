@@ -1,7 +1,7 @@
-"""Random drills: seeded faults of the catalog, one after another, on a truck that drives; judged by the observer.
+"""Random drills: seeded faults of the catalog, one after another, on a driving truck; judged by the observer.
 
-A drill consists of legs. Each leg has a truck and a virtual clock of its own and draws from its own stream of the
-seed, so that legs can run in parallel, and still give the same report.
+A drill consists of legs. Each leg has its own truck and virtual clock, and draws from its own stream of the seed, so
+that legs can run in parallel and still give the same report.
 """
 
 import asyncio
@@ -52,7 +52,7 @@ TRACKER_IN_WORKER: Final[dict[str, Any]] = {"placement": {"tracker": "worker"}}
 
 
 def wired(config: SimulatedTruckConfig) -> SimulatedTruckConfig:
-    """The robot without a map, with the deadman line where a servo controller has an output for it."""
+    """Return the robot without a map, with the deadman line if a servo controller has an output for it."""
     plain, steering = with_overlay(config, {"map": None}), config.devices.steering
     if (
         steering is None
@@ -69,10 +69,10 @@ def wired(config: SimulatedTruckConfig) -> SimulatedTruckConfig:
 
 
 def unguarded(config: SimulatedTruckConfig) -> tuple[str, ...]:
-    """Motor controllers that nothing stops while they cannot be reached.
+    """Return the motor controllers that nothing stops while they are unreachable.
 
-    The EPOS has no watchdog on RS232: without the deadman line it keeps its last speed, and of a kind that is not known
-    here the same is assumed. Controllers of all shafts have a watchdog; a PCA9685 has none and repeats its last pulses.
+    The EPOS has no watchdog on RS232: without the deadman line it keeps its last speed; the same is assumed of unknown
+    kinds. Controllers of all shafts have a watchdog; a PCA9685 has none and repeats its last pulses.
     """
     devices = config.devices.present()
     drives = {role.value: devices[role].driver.kind for role in SHAFTS if role in devices}
@@ -83,7 +83,7 @@ def unguarded(config: SimulatedTruckConfig) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class FaultOutcome:
-    """Outcome of one fault. Seconds count from the fault, ``recovered_s`` from its end; None: it did not happen."""
+    """Outcome of one fault. Seconds count from the fault, ``recovered_s`` from its end; None: it did not occur."""
 
     fault: str
     kind: FaultKind
@@ -126,7 +126,7 @@ class FaultOutcome:
 
 @dataclass(frozen=True, slots=True)
 class DrillReport:
-    """A whole drill."""
+    """Report of a whole drill."""
 
     seed: int
     outcomes: tuple[FaultOutcome, ...]
@@ -143,16 +143,16 @@ class DrillReport:
 
     @property
     def score(self) -> float:
-        """Mean, 0..100."""
+        """Mean score, 0..100."""
         return float(np.mean([outcome.score for outcome in self.outcomes])) if self.outcomes else 0.0
 
     @property
     def blocked(self) -> int:
-        """Faults that left the truck before an obstacle."""
+        """Faults that left the truck in front of an obstacle."""
         return sum(outcome.blocked for outcome in self.outcomes)
 
     def recovery(self, percent: float) -> float | None:
-        """Percentile of the recovery times, s, of faults with a recovery."""
+        """Return a percentile of the recovery times (s) of faults with a recovery."""
         times = [outcome.recovered_s for outcome in self.outcomes if outcome.recovered_s]
         return float(np.percentile(times, percent)) if times else None
 
@@ -178,7 +178,7 @@ class DrillReport:
 
 
 def check_drivable(config: SimulatedTruckConfig) -> None:
-    """Refuse a robot without motors.
+    """Reject a robot without motors.
 
     Raises:
         InputError: its body lacks motors or steering.
@@ -191,11 +191,11 @@ class Drill:
     """``count`` faults of one seed.
 
     Args:
-        seed: everything random comes from it.
-        count: how many faults.
+        seed: source of all randomness.
+        count: number of faults.
         config: the simulated truck.
-        leg: faults of one truck.
-        faults: kinds of faults that are drawn; empty: all that the robot can have.
+        leg: number of faults per truck.
+        faults: kinds of faults to draw; empty: all that the robot can have.
 
     Raises:
         InputError: nothing drives the robot, its tracker has no path, or it cannot have one of the ``faults``.
@@ -220,7 +220,7 @@ class Drill:
             raise InputError(f"fault {missing[0]}: expected one that {config.robot} can have: {', '.join(known)}")
 
     def legs(self) -> list[DrillLeg]:
-        """The parts that can run in parallel."""
+        """Return the parts that can run in parallel."""
         starts = range(0, self.count, self._leg)
         return [
             DrillLeg(self._config.model_dump(), self.seed, number, min(self._leg, self.count - start), self._faults)
@@ -234,7 +234,7 @@ class Drill:
         resume: Path | None = None,
         report: Callable[[list[FaultOutcome]], None] = lambda _: None,
     ) -> DrillReport:
-        """Run all of it; arguments and errors as of ``run_legs``."""
+        """Run the whole drill; arguments and errors as for ``run_legs``."""
         return DrillReport(self.seed, run_legs(self.legs(), run_leg, _OUTCOMES, jobs, resume, report))
 
 
@@ -248,7 +248,7 @@ def run_leg(leg: DrillLeg) -> list[FaultOutcome]:
 
 
 class _LegRun:
-    """Drives, starts a fault, ends it and drives again, fault by fault."""
+    """Drives, injects a fault, ends it and drives again, fault by fault."""
 
     def __init__(self, leg: DrillLeg, clock: VirtualClock, folder: str) -> None:
         self._clock = clock
@@ -265,7 +265,7 @@ class _LegRun:
         self._outcomes: list[FaultOutcome] = []
 
     async def run(self) -> list[FaultOutcome]:
-        """All faults; a truck that is stuck is replaced by a new one."""
+        """Run all faults; a truck that is stuck is replaced by a new one."""
         left = self._faults
         while left:
             before = len(self._outcomes)
@@ -290,7 +290,7 @@ class _LegRun:
 
 
 def _catalog(config: SimulatedTruckConfig, workers: tuple[str, ...] = ()) -> FaultCatalog:
-    """Faults of a robot whose daemon has these worker processes."""
+    """Return the faults of a robot whose daemon has these worker processes."""
     return FaultCatalog(
         config.devices,
         config.monitors.present(),
@@ -304,7 +304,7 @@ def _catalog(config: SimulatedTruckConfig, workers: tuple[str, ...] = ()) -> Fau
 def _draw(
     catalog: FaultCatalog, count: int, rng: np.random.Generator, without: frozenset[FaultKind]
 ) -> list[CatalogFault]:
-    """The faults of a leg, none of the kinds ``without``; a disk becomes full once, unless only that is drawn."""
+    """Draw the faults of a leg, except the kinds ``without``; a disk becomes full once, unless only that is drawn."""
     faults: list[CatalogFault] = []
     for _ in range(count):
         faults.append(catalog.draw(rng, without=without))
@@ -314,9 +314,9 @@ def _draw(
 
 
 async def _react(truck: DrillTruck, fault: CatalogFault, cruise: float, order: Order) -> FaultOutcome | None:
-    """Drive for ``cruise`` seconds, have the fault, give an order that stops, end the fault, recover.
+    """Drive for ``cruise`` seconds, inject the fault, send a stopping order, end the fault, recover.
 
-    None: the truck could not be driven before it.
+    Return None if the truck could not be driven before the fault.
     """
     clock, observer, context = truck.clock, truck.observer, truck.rig.context
     if not await _drive(truck):
@@ -369,13 +369,13 @@ async def _react(truck: DrillTruck, fault: CatalogFault, cruise: float, order: O
 
 
 async def _drive(truck: DrillTruck) -> bool:
-    """Arm and come to speed."""
+    """Arm and accelerate to speed."""
     truck.observer.arm()
     return await truck.until(truck.drives, RECOVERY_LIMIT, Order.ARM)
 
 
 def reasons_of(report: Event | GateState | HealthTable) -> Iterator[Reason]:
-    """Return the reasons that explain a stop."""
+    """Yield the reasons that explain a stop."""
     match report:
         case Event():
             named: Iterable[Reason] = (report.reason,) if report.severity is not Severity.INFO else ()

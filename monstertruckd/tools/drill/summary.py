@@ -29,7 +29,7 @@ class FamilySummary:
 
 
 def by_family(outcomes: Iterable[TrialOutcome]) -> list[FamilySummary]:
-    """One summary for each family that was tried, by name."""
+    """Return one summary for each tested family, by name."""
     found: dict[str, list[TrialOutcome]] = defaultdict(list)
     for outcome in outcomes:
         for family in dict.fromkeys(outcome.families):
@@ -54,7 +54,7 @@ def _summary(family: str, outcomes: list[TrialOutcome]) -> FamilySummary:
 
 
 def without_reason(summaries: Iterable[FamilySummary]) -> Iterator[str]:
-    """Lines on the families without a reason: known ones with their limit, the others by name."""
+    """Yield lines on the families without a reason: known ones with their limit, the others by name."""
     by_row, others = explained(summary.family for summary in summaries if not summary.noticed)
     for row, families in by_row.items():
         yield f"nothing reveals {', '.join(families)}: {row.why}; limit: {row.limit}"
@@ -63,7 +63,7 @@ def without_reason(summaries: Iterable[FamilySummary]) -> Iterator[str]:
 
 
 def troubles(outcomes: Iterable[TrialOutcome]) -> Iterator[str]:
-    """One line for each unsafe event and each robot that did not recover."""
+    """Yield one line for each unsafe event and each robot that did not recover."""
     for outcome in outcomes:
         where = f"trial {outcome.number}, {'reverse' if outcome.reverse else 'forwards'}, {' + '.join(outcome.faults)}"
         for violation in outcome.violations:

@@ -44,13 +44,13 @@ DaemonReport = Event | GateState | HealthTable
 
 
 class DrivingStation:
-    """A station that sends drive requests, 20 a second, until it is made silent.
+    """A station that sends 20 drive requests a second until it is silenced.
 
     Args:
         bus: bus of the daemon.
-        clock: time.
-        speed: requested (m/s).
-        front: angle of the bicycle's front axle that is requested (rad).
+        clock: source of time.
+        speed: requested speed (m/s).
+        front: requested angle of the bicycle's front axle (rad).
     """
 
     def __init__(self, bus: Bus, clock: VirtualClock, speed: float = 0.18, front: float = 0.0) -> None:
@@ -67,7 +67,7 @@ class DrivingStation:
         self.attach(bus)
 
     def attach(self, bus: Bus) -> None:
-        """Send to a daemon, silent at first."""
+        """Connect to a daemon, initially silent."""
         self.silent = True
         self._bus = bus
         self._gate = bus.subscribe(topics.GATE, latest())
@@ -79,7 +79,7 @@ class DrivingStation:
             await self._clock.sleep(0.05)  # seconds from one request of a station to the next
 
     def send(self) -> None:
-        """One request, unless it is silent."""
+        """Send one request, unless silent."""
         if self.silent:
             return
         now = self._clock.now()
@@ -120,7 +120,7 @@ def _can(chassis: Chassis, twist: Twist2) -> bool:
 
 
 def stays_clear(world: World, twist: Twist2) -> bool:
-    """Whether a robot touches nothing for twice ``MAY_MOVE``, moving as it does or with ``twist``."""
+    """Whether a robot stays free of contact for twice ``MAY_MOVE``, at its current motion or at ``twist``."""
     pose, motions = world.plant.pose, (twist, world.plant.twist)
     looks = 8  # number of poses checked over that time
     times = [2 * MAY_MOVE * (look + 1) / looks for look in range(looks)]
@@ -128,18 +128,18 @@ def stays_clear(world: World, twist: Twist2) -> bool:
 
 
 class Wanderer(DrivingStation):
-    """A station that drives at random, in both directions and with all ways to steer.
+    """A station that drives at random, in both directions and all steering modes.
 
-    Where the gate stops before unseen ground it holds the second control after a while, until it drives elsewhere.
-    Nothing on a robot without range sensors stops it before an obstacle: its operator looks, and keeps it clear.
+    When the gate stops the robot before unseen ground, it holds the second control after a while, until it drives
+    elsewhere. A robot without range sensors is not stopped before obstacles by the gate: its operator keeps it clear.
 
     Args:
         bus: bus of the daemon.
-        clock: time.
+        clock: source of time.
         config: limits of the robot.
-        rng: randomness.
-        confirm: called with each request into unseen ground that it confirms.
-        clear: whether the robot touches nothing soon if it moves at a twist; of an operator who looks.
+        rng: source of randomness.
+        confirm: called with each confirmed request into unseen ground.
+        clear: whether the robot stays free of contact soon at a twist; of an operator who watches.
     """
 
     def __init__(
@@ -167,7 +167,7 @@ class Wanderer(DrivingStation):
         """Only backwards or forwards from now on; None: either."""
 
     def choose(self, *, backwards: bool | None = None) -> None:
-        """Choose another motion, and for how long; ``backwards`` as the attribute, for it and those that follow."""
+        """Choose another motion and its duration; ``backwards`` as the attribute, for this motion and later ones."""
         rng = self._rng
         self.backwards = backwards
         back = bool(rng.random() < 0.5) if backwards is None else backwards
@@ -187,13 +187,13 @@ class Wanderer(DrivingStation):
         self._until = self._clock.now() + round(float(rng.uniform(0.4, 2.0)) * SECOND)
 
     def run_up(self, seconds: float) -> None:
-        """Drive straight ahead, at most so long."""
+        """Drive straight ahead, at most for ``seconds``."""
         self.choose(backwards=False)
         self.speed, self.front, self.rear = self._limits[1], 0.0, 0.0
         self._until = self._clock.now() + round(seconds * SECOND)
 
     def send(self) -> None:
-        """One request, unless it is silent; now and then of another motion."""
+        """Send one request, unless silent; now and then of another motion."""
         now = self._clock.now()
         if now >= self._until:
             self.choose(backwards=self.backwards)
@@ -211,7 +211,7 @@ class Wanderer(DrivingStation):
         super().send()
 
     def _keep_clear(self) -> None:
-        """Choose motions until one stays clear; if none does, stand."""
+        """Choose motions until one stays clear; stand if none does."""
         # 10: motions that it considers for a request; if none of them stays clear, the robot shall stand
         for _ in range(10):
             if self._clear(self._requested()):
@@ -226,11 +226,11 @@ class Wanderer(DrivingStation):
 
 
 class GoalGiver:
-    """An operator that gives the planner one goal after another, at random free places of the world.
+    """An operator that sends the planner one goal after another, at random free places of the world.
 
     Args:
         truck: truck whose planner drives.
-        rng: randomness.
+        rng: source of randomness.
     """
 
     def __init__(self, truck: "DrillTruck", rng: np.random.Generator) -> None:
@@ -241,7 +241,7 @@ class GoalGiver:
         self._places = np.column_stack((columns, rows)) * known.resolution + np.array(known.origin[:2])
 
     async def run(self) -> None:
-        """Give a goal whenever the robot is armed and has none, until cancelled; the planner may refuse it."""
+        """Send a goal whenever the robot is armed and has none, until cancelled; the planner may refuse it."""
         while True:
             truck = self._truck
             goal = truck.rig.bus.newest(GOAL)
@@ -257,11 +257,11 @@ class DrillTruck:
     """One rig with its operator and observer.
 
     Args:
-        rig: not running yet.
-        by_station: a station drives it, in a circle.
-        wander: randomness of a station that drives it at random instead; of a judged one.
-        judged: only the world's truth is looked at, by a ``WorldJudge``.
-        by_hand: the station drives from the beginning; otherwise a tracker does until the attribute is set.
+        rig: rig that is not running yet.
+        by_station: whether a station drives it, in a circle.
+        wander: randomness of a station that drives a judged truck at random instead.
+        judged: whether only a ``WorldJudge`` observes the world's truth.
+        by_hand: whether the station drives from the start; otherwise a tracker does until the attribute is set.
     """
 
     def __init__(
@@ -294,7 +294,7 @@ class DrillTruck:
             self.station = DrivingStation(rig.bus, rig.clock, 0.8 * rig.config.gate.speed, angle)
 
     def _looks(self) -> Callable[[Twist2], bool]:
-        """Whether a motion stays clear, as the operator sees it; a robot with range sensors has to see for itself."""
+        """Return whether a motion stays clear for the operator; a robot with range sensors must see for itself."""
         if RANGE_SENSORS & self.rig.config.devices.present().keys():
             return lambda _: True
         return partial(stays_clear, self.rig.world)
@@ -311,7 +311,7 @@ class DrillTruck:
         return self.observer.speed if self.judge is None else self.judge.speed
 
     def listen(self) -> None:
-        """Listen to the rig's daemon if it is a new one."""
+        """Subscribe to the rig's daemon if it is a new one."""
         rig = self.rig
         if self._heard is rig.daemon:
             return
@@ -336,7 +336,7 @@ class DrillTruck:
         judged: bool = False,
         by_hand: bool = True,
     ) -> AsyncIterator[Self]:
-        """World, daemon and observer run while the context lasts; arguments as of the class.
+        """Run world, daemon and observer while the context is open; arguments as for the class.
 
         Raises:
             BaseException: error that ended the daemon early.
@@ -390,9 +390,9 @@ class DrillTruck:
         return condition()
 
     async def order(self, order: Order) -> None:
-        """Give an order, if the daemon runs; a refused one is not an error.
+        """Send an order if the daemon runs; a refusal is not an error.
 
-        It arrives on the robot's computer, and waits there as long as that is stalled.
+        It waits on the robot's computer while that is stalled.
         """
         if not self.rig.daemon_ended:
             giving = asyncio.get_running_loop().create_task(self.operator.order(order), context=on_computer())
@@ -400,11 +400,11 @@ class DrillTruck:
                 await giving
 
     def drives(self) -> bool:
-        """Whether it moves at a speed worth stopping."""
+        """Whether it moves fast enough that a stop is observable."""
         return abs(self.speed) > self._cruise
 
     def reports(self) -> list[DaemonReport]:
-        """Events, gate states and health tables since the last call, by time."""
+        """Return events, gate states and health tables since the last call, by time."""
         return sorted(self._drained(), key=lambda report: report.stamp)
 
     def _drained(self) -> Iterator[DaemonReport]:

@@ -1,7 +1,6 @@
-"""Families of faults that no second measure of the robots here reveals, and the limit that holds then.
+"""Families of faults that no second measure of the robots here reveals, and the limit that remains.
 
-A drill prints the families that it tried without any reason: families of this table with their limit, the others by
-name.
+A drill prints the tested families without a reason: families of this table with their limit, the others by name.
 """
 
 from collections.abc import Iterable
@@ -10,7 +9,7 @@ from typing import Final, NamedTuple
 
 
 class Unrevealed(NamedTuple):
-    """Families with the same reason."""
+    """Families with the same explanation."""
 
     families: tuple[str, ...]
     """Patterns of their names."""
@@ -89,12 +88,12 @@ UNREVEALED: Final = (
 
 
 def limit_of(family: str) -> Unrevealed | None:
-    """The row that describes a family, None if a second measure should reveal it."""
+    """Return the row that describes a family; None if a second measure should reveal it."""
     return next((row for row in UNREVEALED if row.holds(family)), None)
 
 
 def explained(families: Iterable[str]) -> tuple[dict[Unrevealed, list[str]], list[str]]:
-    """Families by the row that describes them, and those that none describes."""
+    """Return the families by the row that describes them, and those without a row."""
     by_row: dict[Unrevealed, list[str]] = {}
     others = []
     for family in families:

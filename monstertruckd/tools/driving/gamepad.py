@@ -106,7 +106,7 @@ class PadMapping(Schema):
     buttons: dict[Button, Action] = Field(default_factory=lambda: dict(USUAL))
 
     def fits(self, name: str) -> bool:
-        """Return whether the mapping applies to a device of this name."""
+        """Whether the mapping applies to a device of this name."""
         return fnmatch(name, self.name)
 
 
@@ -161,7 +161,7 @@ class Pad:
         return actions
 
     def release(self) -> None:
-        """Let go: the deadman button is valid again once released, a stick once it moves."""
+        """Let go: the deadman button is valid again after its release, a stick after a movement."""
         self._trusted = False
         # Other buttons may have been released meanwhile: their next press must not pass for a continued one.
         self._pressed &= {BUTTONS[name] for name in self.mapping.deadman}
@@ -173,13 +173,13 @@ class Pad:
         return self._any_of(self.mapping.deadman)
 
     def _any_of(self, names: tuple[Button, ...]) -> bool:
-        """Return whether any of these buttons is held."""
+        """Whether any of these buttons is held."""
         held = any(BUTTONS[name] in self._pressed for name in names)
         return held or any(self._axes.get(AXES[name], -1.0) > HALF for name in names if name in AXES)
 
     @property
     def held(self) -> bool:
-        """Whether the deadman button is being held."""
+        """Whether the deadman button is held."""
         return self._trusted and self._deadman
 
     def motion(self, mode: SteeringMode, speed: float, angle: float) -> TeleopRequest:

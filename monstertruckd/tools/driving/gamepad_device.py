@@ -1,4 +1,4 @@
-"""Gamepad of this computer: find it, read it, make it rumble, and find it again after it was unplugged.
+"""Gamepad of this computer: search, reading, rumble, and a new search after it was unplugged.
 
 Kernel request numbers are from linux/input.h; ``struct ff_effect`` has 48 bytes on 64-bit kernels.
 """
@@ -62,7 +62,7 @@ class PadLink:
             self._close()
 
     def rumble(self, strength: float, seconds: float) -> None:
-        """Rumble with a strength of 0 to 1; a gamepad without rumble does nothing."""
+        """Rumble with a strength of 0 to 1; no effect on a gamepad without rumble."""
         if self._file is None:
             return
         size = round(0xFFFF * strength)
@@ -96,7 +96,7 @@ class PadLink:
             os.close(file)
 
     def _read(self, *, act: bool = True) -> bool:
-        """Read a few waiting records; returns False if there were none."""
+        """Read a few waiting records; return False if there are none."""
         assert self._file is not None
         assert self.pad is not None
         try:

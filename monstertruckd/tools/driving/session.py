@@ -157,13 +157,13 @@ class DriveSession:
         self._commands.put_nowait(Order.ARM)
 
     def _hold_arming(self) -> None:
-        """Cancel an arm order that was not sent yet."""
+        """Cancel an arm order that has not been sent yet."""
         if self._arming is not None:
             self._arming.cancel()
             self._arming = None
 
     async def _obey(self, client: TruckClient) -> None:
-        """Send the keys' orders, each without waiting for the previous outcome; returns when the user quits."""
+        """Send the keys' orders without waiting for outcomes; return when the user quits."""
         outcomes: set[asyncio.Task[GateState]] = set()
         try:
             while (command := await self._commands.get()) != "end":
@@ -182,7 +182,7 @@ class DriveSession:
             self._stream.refusal = f"{order.value} refused: {error}"
 
     async def _ask(self, client: TruckClient) -> None:
-        """Deadman switch: send requests while keys are held, nothing otherwise."""
+        """Send requests while keys are held, as a deadman switch."""
         before = self._clock.now()
         while True:
             await self._clock.sleep(1.0 / REQUEST_RATE)
@@ -263,7 +263,7 @@ class DriveSession:
             await self._clock.sleep(1.0)  # interval between measurements of the round trip (s)
 
     async def _draw(self, follower: Follower) -> None:
-        """Show the state; returns when the terminal is gone, even if the keyboard notices it later."""
+        """Show the state; return when the terminal is gone, even if the keyboard notices it later."""
         console = Console(file=self._screen)
         with suppress(OSError), Live(console=console, screen=True, auto_refresh=False) as live:
             while True:
@@ -374,6 +374,6 @@ def _restore(keyboard: IO[Any], screen: IO[Any], before: list[Any]) -> None:
 
 
 def forget_input(keyboard: IO[Any]) -> None:
-    """Discard typed keys that were not read yet."""
+    """Discard typed keys that have not been read yet."""
     with suppress(termios.error):
         termios.tcflush(keyboard, termios.TCIFLUSH)

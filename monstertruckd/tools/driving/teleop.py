@@ -50,7 +50,7 @@ Command = Order | Literal["end"]
 
 
 class KeyReader:
-    """Cuts a stream of bytes into keys; ignores pasted text."""
+    """Splits a stream of bytes into keys; ignores pasted text."""
 
     def __init__(self) -> None:
         self._rest = b""
@@ -75,11 +75,11 @@ class KeyReader:
         return ["escape"] if rest == ESCAPE and not self._pasting else []
 
     def clear(self) -> None:
-        """Forget all bytes so far."""
+        """Discard all bytes so far."""
         self._rest, self._pasting = b"", False
 
     def _next(self) -> bytes | None:
-        """Cut off the first complete key; None without one."""
+        """Remove and return the first complete key; None without one."""
         length = _length(self._rest)
         if length is None:
             return None
@@ -257,7 +257,7 @@ class Teleop:
         return self._motion() if asked or self._asking else None
 
     def _motion(self) -> TeleopRequest:
-        """Return the motion that the keys request."""
+        """Return the motion requested by the keys."""
         ahead = self._throttle * self.speed
         if self.mode is SteeringMode.TWIST:
             twist = (ahead, self._side * self.speed, self._turn * self.speed / TURN_RADIUS)

@@ -1,1 +1,1 @@
-"""The daemon as a service of the computer: what systemd and udev are given, and how it gets there and away again."""
+"""The daemon as a system service: systemd unit and udev rules, installation and removal."""

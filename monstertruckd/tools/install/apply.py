@@ -51,7 +51,7 @@ class Change(StrEnum):
 
 @dataclass(slots=True)
 class InstallReport:
-    """Actions done, or planned."""
+    """Actions done or planned."""
 
     changes: dict[Path, Change] = field(default_factory=dict)
     commands: list[Command] = field(default_factory=list)
@@ -68,10 +68,10 @@ Run = Callable[[Sequence[str]], str]
 
 
 def run_command(arguments: Sequence[str]) -> str:
-    """Run a program of the system without a shell; returns its standard output.
+    """Run a system program without a shell; return its standard output.
 
     Raises:
-        NotFoundError: there is none.
+        NotFoundError: it does not exist.
         CommandFailedError: it failed; the text is its own.
     """
     try:
@@ -85,16 +85,16 @@ def run_command(arguments: Sequence[str]) -> str:
 
 
 def runs_here(root: Path) -> bool:
-    """Whether the system below ``root`` is the one that runs, by systemd: not an image, a chroot or a container."""
+    """Whether systemd runs the system below ``root``: it is not an image, a chroot or a container."""
     return root == Path("/") and below(root, BOOTED).is_dir()
 
 
 def install(plan: InstallPlan, root: Path, *, dry: bool = False, run: Run = run_command) -> InstallReport:
-    """Write changed files, then notify the running system; an image that does not run is only written.
+    """Write changed files, then notify the running system; an image that is not running is only written.
 
     Raises:
-        InputError: a file is masked, is none, or is behind a link out of ``root``; nothing has been written then.
-        NotPermittedError: not allowed to write there.
+        InputError: a file is masked, not a regular file, or behind a link out of ``root``; nothing has been written.
+        NotPermittedError: no permission to write there.
         NotFoundError, CommandFailedError: see ``run_command``; running it again continues from there.
     """
     report = InstallReport({file.path: _change(root, file) for file in plan.files})
@@ -119,11 +119,11 @@ def install(plan: InstallPlan, root: Path, *, dry: bool = False, run: Run = run_
 
 
 def uninstall(root: Path, *, dry: bool = False, run: Run = run_command) -> InstallReport:
-    """Stop the service and take its files away.
+    """Stop the service and remove its files.
 
     Raises:
         InputError: a file is behind a link out of ``root``.
-        NotPermittedError: not allowed to.
+        NotPermittedError: no permission.
         NotFoundError, CommandFailedError: see ``run_command``.
     """
     report = InstallReport({path: Change.REMOVED for path in FILES if os.path.lexists(place_of(root, path))})
@@ -194,7 +194,7 @@ def _write(root: Path, file: PlannedFile, report: InstallReport) -> None:
 
 
 def _keep(place: Path) -> Path:
-    """Give a file a second name, with a ~, under which it stays when it is replaced; the first one is never gone."""
+    """Add a second name, with a ~, under which the file remains when it is replaced; the first name always exists."""
     previous = place.with_name(f"{place.name}~")
     if previous.is_symlink() or not previous.is_file() or previous.read_bytes() != place.read_bytes():
         previous.unlink(missing_ok=True)
@@ -204,10 +204,10 @@ def _keep(place: Path) -> Path:
 
 @contextmanager
 def as_permitted() -> Iterator[None]:
-    """Turns a refused write into an error of ours.
+    """Convert a refused write.
 
     Raises:
-        NotPermittedError: not allowed to write there.
+        NotPermittedError: no permission to write there.
     """
     try:
         yield

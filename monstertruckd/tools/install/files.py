@@ -27,10 +27,10 @@ GROUP = "dialout"
 
 
 def shipped_file(name: str) -> Path:
-    """Path of a file of the folder ``systemd``.
+    """Return the path of a file of the folder ``systemd``.
 
     Raises:
-        NotFoundError: the installation is not whole.
+        NotFoundError: the installation is incomplete.
     """
     path = shipped(f"systemd/{name}")
     if not path.is_file():
@@ -39,7 +39,7 @@ def shipped_file(name: str) -> Path:
 
 
 def filled(name: str, values: dict[str, str]) -> str:
-    """Text of a shipped file, its ``@names@`` replaced; a line with nothing else vanishes if its value is empty."""
+    """Return a shipped file's text with its ``@names@`` replaced; a line of one empty value is removed."""
 
     def value(match: re.Match[str]) -> str:
         return values[match["name"]]
@@ -64,7 +64,7 @@ class Program:
 
     @classmethod
     def present(cls) -> Self:
-        """The one that is running now."""
+        """Return the running program."""
         neutral = shipped_file("neutral.py")
         base = Path(sys.base_prefix)  # may be a link in front of the true folder; both names are used
         reads = dict.fromkeys((Path(sys.prefix), base, base.resolve(), neutral.parents[1]))
@@ -72,12 +72,12 @@ class Program:
 
 
 def unit_text(config: TruckConfig, config_file: Path, user: str, program: Program) -> str:
-    """The unit.
+    """Return the text of the unit.
 
     Args:
-        config: configuration whose drives are stopped after a death.
+        config: configuration whose drives are stopped after a crash.
         config_file: configuration file of the service.
-        user: it runs as.
+        user: user of the service.
         program: command of the service.
 
     Raises:
@@ -99,10 +99,10 @@ def unit_text(config: TruckConfig, config_file: Path, user: str, program: Progra
 
 
 def user_name(name: str) -> str:
-    """``name``, if a user may be called so.
+    """Return ``name`` if it is a valid user name.
 
     Raises:
-        InputError: it may not; a line break in it would add a setting.
+        InputError: it is not; a line break in it would add a setting.
     """
     if not _USER.fullmatch(name):
         raise InputError(f"user {name!r}: expected a lower-case letter or _, then at most 31 of a-z 0-9 _ -")
@@ -110,7 +110,7 @@ def user_name(name: str) -> str:
 
 
 def node_of(role: str, port: AnyPort) -> Path:
-    """Path of the device of ``role`` in /dev once the udev rules are in place."""
+    """Return the path of the device of ``role`` in /dev once the udev rules are installed."""
     return port.path if isinstance(port, PortConfig) else LINKS / role
 
 
@@ -126,13 +126,13 @@ def _stop(config: TruckConfig, program: Program) -> str:
 
 
 def _stop_words(device: Device[Any], words: str) -> str:
-    """Return the words for the stop script, which takes an EPOS for granted."""
+    """Return the arguments for the stop script, whose default is an EPOS."""
     kind = device.kind.name
     return words if kind == "epos" else f"{kind}:{words}"
 
 
 def temporary(program: Program) -> str | None:
-    """Why the service could not run ``program``, or None."""
+    """Return why the service could not run ``program``; None if it can."""
     hidden = (place for place in program.reads if any(place.is_relative_to(folder) for folder in HIDDEN))
     place = next(hidden, None)
     return (
@@ -141,16 +141,16 @@ def temporary(program: Program) -> str | None:
 
 
 def _at_home(program: Program) -> list[Path]:
-    """Paths in hidden folders that the service must still see."""
+    """Return the paths in hidden folders that the service must still access."""
     return [place for place in program.reads if any(place.is_relative_to(home) for home in HOMES)]
 
 
 def _plain(path: Path, without: str = "") -> str:
-    """``path`` for a unit file.
+    """Return ``path`` for a unit file.
 
     Args:
-        path: absolute.
-        without: a sign that ends a path at that place.
+        path: absolute path.
+        without: a character that ends a path at that place.
 
     Raises:
         InputError: it would need quoting.
@@ -163,7 +163,7 @@ def _plain(path: Path, without: str = "") -> str:
 
 
 def rules_text(config: TruckConfig) -> str:
-    """The whole file."""
+    """Return the complete file."""
     return filled("udev.rules", {"devices": "\n".join(_devices(config))})
 
 
@@ -177,7 +177,7 @@ def _devices(config: TruckConfig) -> Iterator[str]:
 
 
 def _device(role: str, port: UsbPortConfig, method: CycleMethod | None, *, camera: bool) -> Iterator[str]:
-    """Rules of one device; by its interface's name, as a hub in its port must not pass for it."""
+    """Yield the rules of one device, by its interface's name, so that a hub in its port does not match."""
     device, by_topology = port.device, is_topology(port.device)
     # The prefix of the controller in udev's name depends on the board; the bus is not part of it.
     itself, key = (
@@ -206,7 +206,7 @@ def _device(role: str, port: UsbPortConfig, method: CycleMethod | None, *, camer
 
 
 def _switch(port: UsbPortConfig) -> Iterator[str]:
-    """Rules that let the daemon switch a port off: for its hub, and for the other half of a USB 3 hub."""
+    """Yield rules that let the daemon switch a port off: for its hub, and for the other half of a USB 3 hub."""
     hub = f'ENV{{ID_PATH}}=="*{port.hub}:1.0"'
     if not is_topology(port.device):
         hub = f'KERNEL=="{port_directory(port.device).split("/")[-2]}"'

@@ -1,7 +1,7 @@
 """Compiles kernels ahead of their first use: ``python -m monstertruckd.tools.install.kernels``.
 
-Those of all workers and of the emulated camera. numba keeps them next to the modules, or in ``NUMBA_CACHE_DIR``. Where
-they are up to date this takes seconds.
+Includes those of all workers and of the emulated camera. numba stores them next to the modules, or in
+``NUMBA_CACHE_DIR``. Takes seconds if they are up to date.
 """
 
 import importlib
@@ -19,10 +19,10 @@ CAMERA: Final = "monstertruck_sim.world.camera:compile_kernels"
 
 
 def compile_kernels(report: Callable[[str], object] = lambda _: None) -> None:
-    """Build every worker once, and draw a picture; what needs packages that are not installed is left out.
+    """Build every worker once, and draw an image; work that needs missing packages is skipped.
 
     Args:
-        report: gets a line before each of them.
+        report: receives a line before each of them.
     """
     targets = (*WORKERS, CAMERA)
     for number, target in enumerate(targets, 1):

@@ -1,4 +1,4 @@
-"""The contents of an installation: files, and programs to notify about them."""
+"""Contents of an installation: files, and programs to notify about them."""
 
 import itertools
 import os
@@ -50,7 +50,7 @@ RESTART: Final[Command] = ("systemctl", "restart", SERVICE)
 
 @dataclass(frozen=True, slots=True)
 class PlannedFile:
-    """One file, or a link where ``target`` is given."""
+    """One file, or a link if ``target`` is given."""
 
     path: Path
     text: str = ""
@@ -68,7 +68,7 @@ class PlannedFile:
 
 @dataclass(frozen=True, slots=True)
 class InstallPlan:
-    """A whole installation."""
+    """A complete installation."""
 
     files: tuple[PlannedFile, ...]
     notes: tuple[str, ...]
@@ -76,19 +76,19 @@ class InstallPlan:
 
 
 def plan(config_file: Path | None, user: str | None, program: Program, root: Path) -> InstallPlan:
-    """Files of a configuration's service.
+    """Return the files of a configuration's service.
 
     Args:
-        config_file: copied to /etc; None, or one that is there: the one the installed unit names, as it is.
-        user: user of the service; None for the installed unit's user, else ``USER``.
+        config_file: copied to /etc; None: the file named by the installed unit, unchanged.
+        user: user of the service; None: the installed unit's user, else ``USER``.
         program: command of the service.
-        root: root of the system that gets it.
+        root: root of the target system.
 
     Raises:
         NotFoundError: no configuration was given and none is installed.
-        ConfigError: it was refused.
-        InputError: systemd could not use the user's name or one of the paths; or the service of the system that runs
-            could not see the program.
+        ConfigError: the configuration is invalid.
+        InputError: systemd could not use the user's name or one of the paths; or the service of the running system
+            could not access the program.
     """
     user = user_name((installed_user(root) or USER) if user is None else user)
     hidden = temporary(program)
@@ -116,9 +116,9 @@ def plan(config_file: Path | None, user: str | None, program: Program, root: Pat
 
 
 def installed_config(root: Path) -> Path | None:
-    """The configuration the installed unit starts the daemon with, without one the usual; None if that is missing too.
+    """Return the installed unit's configuration, or the default one without a unit; None if that is missing too.
 
-    A file the unit names is given even if it is not there.
+    A file named by the unit is returned even if it does not exist.
     """
     unit = text_of(below(root, UNIT)) or ""
     named = re.search(r"^ExecStart=.* --config (/\S+)$", unit, re.MULTILINE)
@@ -127,22 +127,22 @@ def installed_config(root: Path) -> Path | None:
 
 
 def installed_user(root: Path) -> str | None:
-    """Whom the installed unit runs the daemon as."""
+    """Return the user of the installed unit."""
     named = re.search(r"^User=(\S+)$", text_of(below(root, UNIT)) or "", re.MULTILINE)
     return None if named is None else named[1]
 
 
 def below(root: Path, path: Path) -> Path:
-    """Place of an absolute path in the system below ``root``."""
+    """Return the place of an absolute path in the system below ``root``."""
     return root / path.relative_to("/")
 
 
 def _placed(files: Sequence[Path], maps: Sequence[Path], folder: Path) -> tuple[Path, tuple[PlannedFile, ...]]:
-    """Place of the configuration, and the files to copy there; relative places stay the same.
+    """Return the place of the configuration, and the files to copy there; relative places stay the same.
 
     Args:
         files: files of the configuration, its own first; files with absolute paths stay in place.
-        maps: that it names.
+        maps: maps that it names.
         folder: folder of installed configurations.
 
     Raises:
@@ -168,7 +168,7 @@ def _placed(files: Sequence[Path], maps: Sequence[Path], folder: Path) -> tuple[
 
 
 def _save_name(saved: Path, saves: Path) -> str:
-    """Number under which a save is installed: above the installed numbers, because the latest is read."""
+    """Return the number of a save at its installation: above the installed numbers, because the latest is read."""
     newest = next(iter(numbered_saves(saves)), None) if saves.is_dir() else None
     if newest is None:
         return saved.name

@@ -1,4 +1,4 @@
-"""Replaces the version that the service runs by another; the one before comes back if that does not become ready."""
+"""Replaces the service's version by another; the previous one is restored if the new one does not become ready."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,10 +29,10 @@ def upgrade(plan: InstallPlan, root: Path, *, dry: bool = False, run: Run = run_
     The restart returns once the daemon has reported READY, as it does after its first control tick, or has failed to.
 
     Raises:
-        InputError: the system below ``root`` does not run, or see ``install``.
+        InputError: the system below ``root`` is not running, or see ``install``.
         NotFoundError: no service is installed.
         BusyError: the truck is armed; nothing has been restarted.
-        CommandFailedError: the new version did not become ready; the text tells whether the previous one is back.
+        CommandFailedError: the new version did not become ready; the text states whether the previous one is restored.
         NotPermittedError: see ``install``.
     """
     if not runs_here(root):
@@ -52,7 +52,7 @@ def upgrade(plan: InstallPlan, root: Path, *, dry: bool = False, run: Run = run_
 
 @dataclass(frozen=True, slots=True)
 class _Before:
-    """Previous content of a place."""
+    """Previous content of a file."""
 
     place: Path
     text: str | None
@@ -87,10 +87,10 @@ def _replace(plan: InstallPlan, root: Path, before: list[_Before], run: Run) -> 
 
 
 def _refuse_armed(run: Run) -> None:
-    """Refuse by the daemon's last status in systemd, at most a third of the watchdog period old.
+    """Refuse an armed truck by the daemon's last status in systemd, at most a third of the watchdog period old.
 
     Raises:
-        BusyError: the truck is armed, drives or is being stopped.
+        BusyError: the truck is armed, drives or is stopping.
     """
     status = dict(line.split("=", 1) for line in run(STATUS).splitlines() if "=" in line)
     mode = MODES.get(status.get("StatusText", "").split(";")[0])
@@ -108,7 +108,7 @@ def _put_back(before: list[_Before], run: Run) -> None:
 
 
 def _go_back(before: list[_Before], run: Run) -> str:
-    """Run the version before again; returns how that went."""
+    """Run the previous version again; return the result in words."""
     if not before:
         return "no version to return to: the previous one was in the same folder"
     try:

@@ -106,5 +106,5 @@ def test_wizards_and_faults_that_nothing_reveals_have_their_places(site: Path):
 def test_what_was_never_tried_is_gathered_and_code_is_shown(site: Path):
     text = (site / "never-tried.html").read_text()
     assert "no byte has gone to a real" in text
-    assert "Any of this on the truck" in text
+    assert "Nothing on this page has been tested on the truck" in text
     assert 'class="k">def</span>' in (site / "writing-a-driver.html").read_text()
