@@ -44,10 +44,10 @@ class LikelihoodGrid:
 
     @classmethod
     def of(cls, cloud: Cloud, levels: int) -> "LikelihoodGrid":
-        """Likelihood of the surfaces of ``cloud``, which is not empty.
+        """Return the likelihood of the surfaces of ``cloud``, which is not empty.
 
-        Every element is drawn as long as it is: drawn as dots, far samples of a wall would match themselves best
-        without any motion.
+        Every element is drawn with its length: drawn as dots, far samples of a wall would match themselves best without
+        any motion.
         """
         points = cloud.points
         margin = math.ceil(LONGEST_ELEMENT / RESOLUTION) + 5  # cells round the outermost points
@@ -78,14 +78,14 @@ class Peak:
 
 
 def look_ups(points: Array, window: tuple[float, float], levels: int) -> float:
-    """Look-ups of the coarsest level when ``points``, shape (n, 2), are searched for in ``window`` (m, rad)."""
+    """Return the number of look-ups at the coarsest level for ``points``, shape (n, 2), in ``window`` (m, rad)."""
     block = RESOLUTION * min(1 << (levels - 1), max(math.ceil(2 * window[0] / RESOLUTION), 1))
     return 2 * window[1] / RESOLUTION * _lever(points) * (2 * window[0] / block + 1) ** 2 * len(points)
 
 
 @dataclass(frozen=True, slots=True)
 class RivalSearch:
-    """What to know of the best pose that is clearly different from the best of all."""
+    """Required result about the best pose that is clearly different from the best of all."""
 
     apart: float
     """Its distance is at least this, m; or that arc at the typical range."""
@@ -105,7 +105,7 @@ def correlate(
     apart: float = 0.0,
     work: int = WORK,
 ) -> Peak | None:
-    """Search at once; see ``correlation``. ``apart`` is the same as in a ``RivalSearch``; 0: do not look for rivals."""
+    """Search at once; see ``correlation``. ``apart`` is the same as in a ``RivalSearch``; 0: no search for rivals."""
     rival = RivalSearch(apart) if apart > 0 else None
     return finished(correlation(grid, points, guess, window, deviation, least, rival, work))
 
@@ -123,13 +123,13 @@ def correlation(
     """Search the best pose of ``points`` in the grid, in pieces.
 
     Args:
-        grid: where the surfaces are.
+        grid: likelihood of surfaces.
         points: shape (n, 2), in the moving frame, m.
-        guess: shape (3,); middle of the window.
+        guess: shape (3,); centre of the window.
         window: half width of the translation (m) and of the yaw (rad).
         deviation: standard deviation of the guess (m, rad), which breaks ties.
         least: poses with a lower score are ignored.
-        rival: look for a rival, too.
+        rival: search for a rival, too.
         work: maximum number of blocks evaluated by the search, and again by the search for a rival.
     """
     if not len(points):
@@ -198,7 +198,7 @@ def _searched(place: _Place, least: float, enough: float, zone: _Zone, work: flo
 
 
 def _lever(points: Array) -> float:
-    """Typical range of ``points``, m: a yaw moves them by so much per radian."""
+    """Return the typical range of ``points``, m: their displacement per radian of yaw."""
     return float(np.clip(np.percentile(np.hypot(points[:, 0], points[:, 1]), 80), 1.0, 12.0))
 
 
@@ -233,7 +233,7 @@ def _dot(grid: Pyramid, px: float, py: float) -> None:
 
 
 def _pool(source: Pyramid, target: Pyramid, step: int) -> None:
-    """Maximum of each cell and those ``step`` further right, up, and both; the last row and column continue outside."""
+    """Compute the maximum of each cell and those ``step`` further right, up, and both; the edges are continued."""
     right = source.copy()
     np.maximum(source[:, :-step], source[:, step:], out=right[:, :-step])
     np.maximum(source[:, -step:], source[:, -1:], out=right[:, -step:])
@@ -243,7 +243,7 @@ def _pool(source: Pyramid, target: Pyramid, step: int) -> None:
 
 @njit(cache=True)
 def _rotated(points: Array, guess: Array, turns: Array, x0: float, y0: float) -> Blocks:
-    """Cells of the points at the guess, for every turn: shape (turns, points, 2)."""
+    """Return the cells of the points at the guess, for every turn: shape (turns, points, 2)."""
     result = np.empty((turns.size, points.shape[0], 2), np.int32)
     for k in range(turns.size):
         c, s = math.cos(guess[2] + turns[k]), math.sin(guess[2] + turns[k])
@@ -257,7 +257,7 @@ def _rotated(points: Array, guess: Array, turns: Array, x0: float, y0: float) ->
 
 @njit(cache=True)
 def _bound(level: Pyramid, offsets: Blocks, ix: int, iy: int, least: float) -> float:
-    """Upper bound of a block's scores; if it cannot reach ``least``, any number below ``least``."""
+    """Return an upper bound of a block's scores; any number below ``least`` if it cannot reach that."""
     rows, columns = level.shape
     count = offsets.shape[0]
     total, missed = np.int64(0), np.int64(0)
@@ -276,7 +276,7 @@ def _bound(level: Pyramid, offsets: Blocks, ix: int, iy: int, least: float) -> f
 
 
 def _top(levels: int, cells: int) -> int:
-    """The level whose blocks a search begins with."""
+    """Return the level of the blocks with which a search begins."""
     top = levels - 1
     while top > 0 and (1 << top) > 2 * cells:
         top -= 1
@@ -284,7 +284,7 @@ def _top(levels: int, cells: int) -> int:
 
 
 def _per_axis(cells: int, top: int) -> int:
-    """Blocks of level ``top`` along each axis of a window."""
+    """Return the number of blocks of level ``top`` along each axis of a window."""
     return (2 * cells + (1 << top)) // (1 << top)
 
 
@@ -304,7 +304,7 @@ def _coarsest(
     level: Pyramid, offsets: Blocks, turns: Array, first: int, most: int, top: int, cells: int, by_cell: float,
     by_turn: float, least: float,
 ) -> tuple[Blocks, Array]:  # fmt: skip
-    """Blocks (turn index, x, y, level) of the coarsest level for ``most`` turns from ``first`` on, and their bounds."""
+    """Return blocks (turn index, x, y, level) of the coarsest level for ``most`` turns from ``first``, with bounds."""
     width = 1 << top
     per_axis = (2 * cells + width) // width
     last = min(first + most, turns.size)
@@ -334,14 +334,13 @@ def _search(
     bounds: Array, shut_k: int, shut_x: float, shut_y: float, shut_cells: float, shut_turns: float, enough: float,
     most: int, state: _State,
 ) -> tuple[_State, float, bool]:  # fmt: skip
-    """Best-first branch and bound: returns the state, the bound of a pose not evaluated, and whether it is done.
+    """Search by best-first branch and bound; return the state, the bound of unevaluated poses, and whether it is done.
 
-    The turn index is -1 if nothing reached the first ``best``. The search begins with the sorted ``blocks`` of the
-    coarsest level, and pauses when more than ``most`` below it were evaluated. The block of the greatest bound is next,
-    whatever its size: depth first, a search that ends early would have seen one corner of a great window, and not the
-    place that fits.
-    Poses within ``shut_cells`` and ``shut_turns`` of (shut_x, shut_y, shut_k) are excluded. One that scores more than
-    ``enough`` ends the search.
+    The turn index is -1 if no pose reached the initial ``best``. The search begins with the sorted ``blocks`` of the
+    coarsest level, and pauses after evaluating more than ``most`` blocks below it. The block with the largest bound is
+    next, whatever its size: an interrupted depth-first search would have seen one corner of a large window instead of
+    the place that fits. Poses within ``shut_cells`` and ``shut_turns`` of (shut_x, shut_y, shut_k) are excluded. A pose
+    that scores more than ``enough`` ends the search.
     """
     best, best_k, best_x, best_y, taken, size, keys, heap = state
     work, done = 0, False
@@ -399,7 +398,7 @@ def _float(keys: Array, heap: Blocks, at: int, bound: float, k: int, x: int, y: 
 
 @njit(cache=True)
 def _sink(keys: Array, heap: Blocks, size: int) -> None:
-    """Put the last block, ``size``, in the place of the first, which was taken."""
+    """Move the last block, ``size``, to the place of the first, which was removed, and restore the heap."""
     bound = keys[size]
     at = 0
     while 2 * at + 1 < size:
@@ -415,20 +414,20 @@ def _sink(keys: Array, heap: Blocks, size: int) -> None:
 
 @dataclass
 class Submap:
-    """A cloud and, when requested, its likelihood pyramids."""
+    """A cloud and, on request, its likelihood pyramids."""
 
     cloud: Cloud
     _grids: dict[int, LikelihoodGrid] = field(default_factory=dict)
 
     def grid_cost(self, levels: int) -> float:
-        """Work of making that grid; 0 once it is made."""
+        """Return the work of making that grid; 0 once it exists."""
         if levels in self._grids:
             return 0.0
         edges = (self.cloud.points.max(axis=0) - self.cloud.points.min(axis=0)) / RESOLUTION + (2 << (levels - 1))
         return Work.DRAWN * len(self.cloud.points) + Work.CELL * levels * float(edges.prod())
 
     def grid(self, levels: int) -> LikelihoodGrid:
-        """Likelihood pyramid of at least this many levels."""
+        """Return a likelihood pyramid of at least this many levels."""
         known = self._grids.get(levels)
         if known is None:
             known = self._grids[levels] = LikelihoodGrid.of(self.cloud, levels)
@@ -436,7 +435,7 @@ class Submap:
 
 
 def merged(scans: Sequence[Scan], poses: Array) -> Scan:
-    """Elements of all ``scans`` at ``poses`` (shape (n, 3)), averaged where they are the same piece of surface."""
+    """Return the elements of all ``scans`` at ``poses`` (shape (n, 3)), averaged on the same piece of surface."""
     points, normals, variances, extents = [], [], [], []
     for scan, pose in zip(scans, poses, strict=True):
         turn = rotation(pose[2]).T
@@ -462,7 +461,7 @@ def merged(scans: Sequence[Scan], poses: Array) -> Scan:
 def _average(
     points: Array, normals: Array, variances: Array, extents: Array, keys: NDArray[np.int64], order: NDArray[np.int64]
 ) -> tuple[Array, Array, Array, Array]:
-    """Means of runs of equal keys; points are weighted by how well they lie on their surface."""
+    """Return the means of runs of equal keys; points are weighted by how well they lie on their surface."""
     n = keys.size
     runs = 0
     for i in range(n):

@@ -40,10 +40,10 @@ def escape_motion(
         field: distance field of the obstacles.
         footprint: footprint for the margin.
         cover: discs of the footprint for clearances, see ``cover_footprint``.
-        pose: shape (3,), of the truck, nearer to something than the margin.
-        primitives: shape (n, 3): segments whose signs, curvatures and sideslips may be driven. Of equally long motions
-            the first one is taken.
-        margin: wanted at the end (m).
+        pose: pose of the truck, shape (3,), nearer to an obstacle than the margin.
+        primitives: permitted segments, shape (n, 3): signs, curvatures and sideslips. Of equally long motions the first
+            one is chosen.
+        margin: required at the end (m).
 
     Returns:
         A motion segment, shape (1, 3), or none, shape (0, 3).
@@ -106,7 +106,7 @@ class LocalPlannerCore:
     def begin(
         self, route: PosePath, obstacles: DistanceField, pose: ArrayLike, state: LocalPlannerState
     ) -> CycleStart | LocalPlan:
-        """Cut the route to the window for one cycle, see ``LocalPlanner``; the result, if nothing of it is free.
+        """Cut the route to the window for one cycle, see ``LocalPlanner``; return the result if none of it is free.
 
         Raises:
             InputError: the pose is not finite or has a wrong shape.
@@ -123,11 +123,11 @@ class LocalPlannerCore:
     def cut(
         self, route: PosePath, obstacles: DistanceField, pose: Array, state: LocalPlannerState
     ) -> tuple[PosePath, int] | None:
-        """The rest of the last cycle's band from the truck on, and poses of the route that entered the window since.
+        """Return the rest of the last cycle's band from the truck on, with the route poses new in the window.
 
         Returns:
-            The band, and the number of poses of the route that are in it or behind the truck; None if no pose of the
-            route in the window is free.
+            The band, and the number of route poses that are in it or behind the truck; None if no route pose in the
+            window is free.
         """
         band, entered = state.band, state.entered
         if band is None:
@@ -177,7 +177,7 @@ class LocalPlannerCore:
     def search(
         self, obstacles: DistanceField, pose: Array, band: PosePath, failed: int, *, final: bool
     ) -> tuple[MotionPath | None, PosePath | None, Reason]:
-        """Path along the band by a search of little effort, with the margin or at least without contact.
+        """Search a path along the band with little effort, with the margin or at least without contact.
 
         It leads to the band's end, or to its last free pose in the window: the band may be the path of an earlier
         search, and the truck may have backed off so far that its end is out of the window.
@@ -209,7 +209,7 @@ class LocalPlannerCore:
         return path, found if rest is None else found.then(rest), Reason.OK
 
     def _search_to(self, obstacles: DistanceField, pose: Array, goal: Array) -> tuple[MotionPath | None, Reason]:
-        """Path to a goal; a truck nearer to something than the margin first leaves that."""
+        """Search a path to a goal; a truck nearer to an obstacle than the margin first moves away."""
         out = self.leave_margin(obstacles, pose)
         if out is not None:
             pose = out.end
@@ -224,7 +224,7 @@ class LocalPlannerCore:
         return None, reason
 
     def leave_margin(self, obstacles: DistanceField, pose: Array) -> MotionPath | None:
-        """Motion to a pose that keeps the margin; None if the truck keeps it, or there is no such motion."""
+        """Return a motion to a pose that keeps the margin; None if the truck keeps it, or there is no such motion."""
         if obstacles.free(self.vehicle.footprint, pose[None], self.config.margin)[0]:
             return None
         footprint, margin = self._planners[0].footprint, self.config.margin + CHECK_MARGIN
@@ -239,7 +239,7 @@ class LocalPlannerCore:
         rest: MotionPath | None,
         why: Reason,
     ) -> LocalPlan:
-        """Result without a complete path: the free beginning of the last path, or an approach along the route."""
+        """Return a result without a complete path: the free part of the last path, or an approach along the route."""
         reason = why if why is Reason.START_BLOCKED else Reason.PATH_BLOCKED
         text = f"local search: {why.text}"
         after = replace(state, path=None, failed=state.failed + 1)
@@ -272,7 +272,7 @@ def checked_pose(pose: ArrayLike) -> Array:
     """Return a valid pose (x, y, yaw).
 
     Raises:
-        InputError: it is none.
+        InputError: it is invalid.
     """
     robot_pose = np.array(pose, dtype=np.float64)
     if robot_pose.shape != (3,) or not np.isfinite(robot_pose).all():
@@ -287,7 +287,7 @@ def costs_of(config: LocalPlannerConfig) -> HybridConfig:
 
 
 def remaining_band(band: PosePath, pose: Array) -> PosePath:
-    """The band from the truck on; a cusp that is reached belongs to what follows it."""
+    """Return the band from the truck on; a reached cusp belongs to the following direction."""
     at = nearest_pose(band, pose)
     rest = band.part(at, len(band.poses))
     if len(rest.poses) > 1 and math.hypot(*(rest.poses[0] - pose)[:2]) <= CUSP_REACHED:
@@ -298,7 +298,7 @@ def remaining_band(band: PosePath, pose: Array) -> PosePath:
 
 
 def remaining_path(path: MotionPath, pose: Array) -> tuple[MotionPath, float]:
-    """The rest of a path from its pose nearest to the truck on, and the distance of both, see ``pose_distance``."""
+    """Return a path from its pose nearest to the truck on, and the distance of that pose, see ``pose_distance``."""
     samples = path.sample(0.05)  # sampling of a path to find the nearest pose on it, m
     best, begin, far = math.inf, 0.0, math.inf
     first = 0
@@ -315,7 +315,7 @@ def remaining_path(path: MotionPath, pose: Array) -> tuple[MotionPath, float]:
 def _nearest_on_path(
     path: MotionPath, poses: Array, travelled: Array, first: int, last: int, pose: Array
 ) -> tuple[float, float]:
-    """Metres along the path to the pose nearest to the truck between two samples, and the distance of both."""
+    """Return the length along the path (m) to the pose nearest to the truck between two samples, and its distance."""
     near = first + int(np.argmin(pose_distance(poses[first : last + 1], pose)))
     low, high = travelled[max(near - 1, first)], travelled[min(near + 1, last)]
     x, y, _ = poses[near]
@@ -328,7 +328,7 @@ def _nearest_on_path(
 
 
 def starting_at(band: PosePath, robot_pose: Array) -> PosePath:
-    """A band that begins at the truck; its first pose is dropped if it lies behind or at the truck."""
+    """Return a band that begins at the truck; its first pose is dropped if it lies behind or at the truck."""
     first = band.poses[0]
     if len(band.poses) > 1:
         step = band.poses[1, :2] - first[:2]

@@ -1,8 +1,8 @@
 """Elastic band: poses of a path move away from obstacles and towards each other. Loads numba.
 
-A bubble is a pose and how far every part of the footprint may move from there. Forces and refinement after S. Quinlan
-and O. Khatib, "Elastic bands: connecting path planning and control", 1993, with the parameters of the published
-planner; differences are named at ``BandParameters``.
+A bubble is a pose with the distance that every part of the footprint may move from there. Forces and refinement follow
+S. Quinlan and O. Khatib, "Elastic bands: connecting path planning and control", 1993, with the parameters of the
+published planner; differences are listed at ``BandParameters``.
 """
 
 import math
@@ -63,7 +63,7 @@ class BandParameters(NamedTuple):
 
 @njit(cache=True)
 def distance_and_gradient(field: FieldData, x: float, y: float) -> tuple[float, float, float]:
-    """Distance of a point from the nearest occupied square, m, and its gradient; bilinear, 0 outside."""
+    """Return the distance of a point from the nearest occupied square (m), and its gradient; bilinear, 0 outside."""
     dx, dy = x - field.x, y - field.y
     px = (dx * field.cos + dy * field.sin) / field.resolution - 0.5
     py = (dy * field.cos - dx * field.sin) / field.resolution - 0.5
@@ -82,7 +82,7 @@ def distance_and_gradient(field: FieldData, x: float, y: float) -> tuple[float, 
 
 @njit(cache=True)
 def clearance(field: FieldData, cover: CoveringDiscs, x: float, y: float, yaw: float) -> float:
-    """Minimum distance of the footprint's discs from occupied cells, m, with its gradient; negative for an overlap."""
+    """Return the distance of the footprint's discs from occupied cells (m), negative inside, and its gradient."""
     least = 1e9
     c, s = cos(yaw), sin(yaw)
     for k in range(len(cover.x)):
@@ -137,7 +137,7 @@ def _refine(
         parameters: parameters of the band.
         band: shape (MAX_BUBBLES, 6): x, y, yaw, radius, direction, sideslip; changed in place.
         fixed: shape (MAX_BUBBLES,): bubbles that do not move.
-        count: count of bubbles.
+        count: number of bubbles.
 
     Returns:
         Number of bubbles, and whether the band is connected.
@@ -178,7 +178,7 @@ def _refine(
 def _force(
     field: FieldData, cover: CoveringDiscs, parameters: BandParameters, before: Array, here: Array, after: Array
 ) -> tuple[float, float]:
-    """Attraction of both neighbours and repulsion of obstacles on a bubble, across the band."""
+    """Return the force on a bubble across the band: attraction of both neighbours and repulsion of obstacles."""
     fx, fy = 0.0, 0.0
     for other in (before, after):
         dx, dy = other[0] - here[0], other[1] - here[1]
@@ -244,7 +244,7 @@ def _move(field: FieldData, cover: CoveringDiscs, parameters: BandParameters, ba
 def _align_headings(
     field: FieldData, cover: CoveringDiscs, parameters: BandParameters, band: Array, fixed: BoolArray, count: int
 ) -> None:
-    """Turn every bubble along the band, less its sideslip, unless it is fixed or would touch something."""
+    """Turn every bubble along the band, minus its sideslip, unless it is fixed or would touch an obstacle."""
     for i in range(1, count - 1):
         if fixed[i]:
             continue
@@ -261,7 +261,7 @@ def update_radii(field: FieldData, cover: CoveringDiscs, parameters: BandParamet
     """Compute all radii.
 
     Returns:
-        Return the index of the first bubble that is too small, or ``count``.
+        Index of the first bubble that is too small, or ``count``.
     """
     broken = count
     for i in range(count - 1, -1, -1):
@@ -308,7 +308,7 @@ class BandResult:
 
 
 def cover_footprint(footprint: Footprint | DiscFootprint) -> CoveringDiscs:
-    """Discs that cover a footprint: of a rectangle small ones along the outline and large ones inside."""
+    """Return discs that cover a footprint: for a rectangle small ones along the outline and large ones inside."""
     if isinstance(footprint, DiscFootprint):
         x = np.array(footprint.centres)
         return _discs(x, np.zeros(len(x)), np.full(len(x), footprint.radius))
@@ -330,7 +330,7 @@ def _discs(x: Array, y: Array, radius: Array) -> CoveringDiscs:
 
 
 def band_parameters(config: BandConfig, cover: CoveringDiscs) -> BandParameters:
-    """Parameters of the corrected band."""
+    """Return the parameters of the corrected band."""
     return BandParameters(
         config.overlap, config.internal_gain, config.external_gain, config.iterations, config.depth,
         config.overshoot, config.significant, config.tiny, config.largest,
@@ -345,7 +345,7 @@ def relax_band(
 
     Args:
         path: poses of the reference point, fewer than ``MAX_BUBBLES``.
-        obstacles: in the window.
+        obstacles: obstacles in the window.
         cover: footprint, see ``cover_footprint``.
         parameters: parameters of the forces.
     """

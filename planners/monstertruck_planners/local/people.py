@@ -153,10 +153,10 @@ def meets(
 
     Args:
         walkers: walking people.
-        poses: planned poses of base at the times, from now on, shape (n, 3).
-        times: from now (s), shape (n,).
-        footprint: outline.
-        distance: kept between outline and person (m).
+        poses: planned poses of base at the times, shape (n, 3).
+        times: times from now (s), shape (n,).
+        footprint: outline of the robot.
+        distance: minimum distance between outline and person (m).
         spread: growth of a person's disc with time (m/s).
     """
     for walker in walkers:

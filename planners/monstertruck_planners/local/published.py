@@ -1,11 +1,11 @@
 """The published planner with the faults of its sources, for comparison. Loads numba.
 
-Faults that are kept: the turning radius is 1.0 m whatever the truck; bubbles know the inscribed circle only, and half
-of the clearance; forces and distances without headings, the force before wrongly summed; the truck's centre has to stay
-out of the inflation, so a truck that stands near a wall finds nothing; headings always ahead, a last heading of exactly
-0 overwritten; ``skip_failures`` leaves a gap after its first motion, where the path ends; nothing is kept from one
-cycle to the next but the band; differences of the emergency turn are not wrapped. The sampling tree of its Reeds-Shepp
-planner is our deterministic search, the better of the two.
+These faults are kept: the turning radius is 1.0 m for every truck; bubbles use only the inscribed circle, and half of
+the clearance; forces and distances ignore headings, and the force before is wrongly summed; the truck's centre must be
+outside of the inflation, so a truck near a wall finds no path; headings always point ahead, and a last heading of
+exactly 0 is overwritten; ``skip_failures`` leaves a gap after its first motion, where the path ends; only the band is
+kept from one cycle to the next; differences of the emergency turn are not wrapped. The sampling tree of its Reeds-Shepp
+planner is replaced by our deterministic search, the better of the two.
 """
 
 import math
@@ -38,8 +38,8 @@ class PublishedPlanner:
     """The local planner of kind ``rsband-as-published``.
 
     Args:
-        vehicle: what is driven; results are paths of the base, whatever its reference point.
-        config: strategy.
+        vehicle: the robot; results are paths of the base, whatever its reference point.
+        config: settings.
     """
 
     def __init__(self, vehicle: Vehicle, config: PublishedConfig | None = None) -> None:
@@ -59,7 +59,7 @@ class PublishedPlanner:
         )
 
     def plan(self, route: PosePath, obstacles: DistanceField, pose: ArrayLike, state: LocalPlannerState) -> LocalPlan:
-        """One cycle, see ``LocalPlanner``."""
+        """Execute one cycle, see ``LocalPlanner``."""
         robot_pose = moved(checked_pose(pose), -self.vehicle.reference)
         if state.route is not route:
             state = LocalPlannerState(route=route)
@@ -83,7 +83,7 @@ class PublishedPlanner:
         return LocalPlan(Reason.OK, replace(state, turning=()), path, state.final and ends_at(path, goal))
 
     def _pruned(self, band: PosePath | None, obstacles: DistanceField, robot_pose: Array) -> PosePath | None:
-        """The band from the furthest bubble on that touches the truck's."""
+        """Return the band from its furthest bubble that touches the truck's."""
         if band is None:
             return None
         field, cover = obstacles.data(), self._band.cover
@@ -103,7 +103,7 @@ class PublishedPlanner:
         return self._states.search(obstacles, robot_pose, end, 0, final=True)[0]
 
     def _joined(self, poses: Array, obstacles: DistanceField) -> MotionPath | None:
-        """The path of the strategy."""
+        """Return the path of the configured strategy."""
         strategy, last = self.config.strategy, len(poses) - 1
         if strategy == "start_to_end":
             return self._join(obstacles, poses[0], poses[last])
@@ -124,7 +124,7 @@ class PublishedPlanner:
         return joined(legs) if legs else None
 
     def _emergency(self, state: LocalPlannerState, obstacles: DistanceField, poses: Array) -> LocalPlan:
-        """Emergency turn: back to its start, turned a step further towards the wanted heading."""
+        """Execute an emergency turn: back to its start, turned a step further towards the wanted heading."""
         text = "no Reeds-Shepp motion found"
         if self.config.emergency:
             turning = state.turning or (*poses[0].tolist(), float(poses[1, 2]))
@@ -141,7 +141,7 @@ class PublishedPlanner:
 
 
 def oriented(poses: Array) -> Array:
-    """Headings by the published rule: towards the next pose; the last one keeps its own unless that is exactly 0."""
+    """Return headings by the published rule: towards the next pose; the last one is kept unless it is exactly 0."""
     result = poses.copy()
     steps = np.diff(poses[:, :2], axis=0)
     course = np.arctan2(steps[:, 1], steps[:, 0])

@@ -1,8 +1,8 @@
 """Elastic band, then Reeds-Shepp motions of the truck's own turning radius that join its poses. Loads numba.
 
-The five strategies of the published planner: one motion to the band's end, to the next sub-goal, from pose to
-pose until one fails, the same leaving out poses that fail, and to the furthest pose that can be reached. Where they
-fail a local search takes over; a path is kept while it is free.
+The five strategies of the published planner: one motion to the band's end, to the next sub-goal, from pose to pose
+until one fails, the same without the poses that fail, and to the furthest reachable pose. If they fail, a local search
+replaces them; a path is kept while it is free.
 """
 
 from collections.abc import Callable, Iterator
@@ -51,7 +51,7 @@ class RsbandPlanner:
         self._strategy = strategy
 
     def plan(self, route: PosePath, obstacles: DistanceField, pose: ArrayLike, state: LocalPlannerState) -> LocalPlan:
-        """One cycle, see ``LocalPlanner``."""
+        """Execute one cycle, see ``LocalPlanner``."""
         cycle = self._core.begin(route, obstacles, pose, state)
         if isinstance(cycle, LocalPlan):
             return cycle
@@ -83,7 +83,7 @@ class RsbandPlanner:
         state: LocalPlannerState,
         rest: MotionPath | None,
     ) -> LocalPlan:
-        """Relax the band and join its poses, else search."""
+        """Relax the band and join its poses; search if that fails."""
         whole = starting_at(ahead, robot_pose)
         band = relax_band(whole, obstacles, self._core.cover, self._band_parameters)
         statistics = {
@@ -116,7 +116,7 @@ class RsbandPlanner:
         return self._join(obstacles, robot_pose, band.poses[-1])
 
     def _start_to_next(self, band: PosePath, obstacles: DistanceField, robot_pose: Array) -> MotionPath | None:
-        """Motion to the first pose at the sub-goal's distance, or further if that needs no change of direction."""
+        """Return a motion to the first pose at the sub-goal's distance, or further without a change of direction."""
         travelled = band.travelled
         end = next(
             end
@@ -172,7 +172,7 @@ class RsbandPlanner:
         return path.length > 1.6 * float(pose_distance(path.end, at))
 
     def _via_indices(self, band: PosePath) -> Iterator[int]:
-        """Indices of the poses to be joined: one every ``spacing`` metres, all cusps, and the last one."""
+        """Yield the indices of the poses to join: one every ``spacing`` metres, all cusps, and the last one."""
         travelled = band.travelled
         begin = 0.0
         cusps = {end - 1 for _, end in direction_runs(band.directions)}

@@ -1,15 +1,15 @@
 """Timed elastic band (TEB): poses and times of shortest time, with clearance, within the truck's limits. Loads numba.
 
 The band keeps its homotopy class and its changes of direction; where it is broken a local search finds a new one. At
-the end, violations of constraints that the least squares leave are removed: segments within the limits are driven from
-the truck's pose, so the path is exactly drivable, and it is checked for collisions. Source of the timed band:
-C. Roesmann and others, "Trajectory modification considering dynamic constraints of autonomous robots", 2012.
+the end, remaining violations of constraints are removed: segments within the limits are driven from the truck's pose,
+so the path is exactly drivable, and it is checked for collisions. Source of the timed band: C. Roesmann and others,
+"Trajectory modification considering dynamic constraints of autonomous robots", 2012.
 
-Least squares with analytic derivatives and banded normal equations. Unknowns are x, y, yaw of each pose and the time of
-the interval before it. A residual touches at most three neighbouring poses, so the normal matrix has eleven diagonals
-next to the main one. An interval is expressed in the frame of its middle heading: ``a`` metres along, ``b`` across,
-turned by ``d``. Then the front axle has moved b + l_f d sideways and the rear axle b - l_r d, and the tangents of their
-angles are these over a: linear where a curvature would be singular.
+Least squares with analytic derivatives and banded normal equations. The unknowns are x, y, yaw of each pose and the
+time of the interval before it. A residual depends on at most three neighbouring poses, so the normal matrix has eleven
+diagonals next to the main one. An interval is expressed in the frame of its middle heading: ``a`` metres along, ``b``
+across, turned by ``d``. The front axle has then moved b + l_f d sideways and the rear axle b - l_r d, and the tangents
+of their angles are these over a: linear where a curvature would be singular.
 """
 
 import math
@@ -85,7 +85,7 @@ class NormalEquations(NamedTuple):
 
 @njit(cache=True)
 def _add(system: NormalEquations, base: int, residual: float) -> float:
-    """Take in a residual whose derivatives are in ``jacobian``, first unknown ``base``; clears the jacobian."""
+    """Add a residual with its derivatives in ``jacobian``, first unknown ``base``; clear the jacobian."""
     jacobian = system.jacobian
     for i in range(WIDTH):
         if jacobian[i] == 0.0:
@@ -100,7 +100,7 @@ def _add(system: NormalEquations, base: int, residual: float) -> float:
 
 @njit(cache=True)
 def _interval(band: Array, i: int, out: Array) -> None:
-    """a, b, d and cosine and sine of the middle heading of the interval before pose i."""
+    """Compute a, b, d, and cosine and sine of the middle heading, of the interval before pose i."""
     middle = 0.5 * (band[i - 1, 2] + band[i, 2])
     c, s = cos(middle), sin(middle)
     dx, dy = band[i, 0] - band[i - 1, 0], band[i, 1] - band[i - 1, 1]
@@ -110,7 +110,7 @@ def _interval(band: Array, i: int, out: Array) -> None:
 
 @njit(cache=True)
 def _spread(jacobian: Array, at: int, v: Array, da: float, db: float, dd: float, dt: float) -> None:
-    """Derivatives by the unknowns from those by a, b, d, t of an interval; ``at``: index of its first pose's x."""
+    """Add the derivatives by the unknowns, from those by a, b, d, t of an interval; ``at``: index of its first x."""
     c, s = v[3], v[4]
     gx, gy = da * c - db * s, da * s + db * c
     turn = 0.5 * (da * v[1] - db * v[0])
@@ -127,7 +127,7 @@ def _spread(jacobian: Array, at: int, v: Array, da: float, db: float, dd: float,
 def _interval_terms(
     parameters: TebParameters, band: Array, direction: Array, i: int, system: NormalEquations, v: Array
 ) -> float:
-    """Residuals of the interval before pose i."""
+    """Add the residuals of the interval before pose i."""
     total = 0.0
     base = 4 * (i - 1)
     jacobian, sign, t = system.jacobian, direction[i], band[i, 3]
@@ -167,7 +167,7 @@ def _interval_terms(
 def _pair_terms(
     parameters: TebParameters, band: Array, direction: Array, i: int, system: NormalEquations, v: Array, u: Array
 ) -> float:
-    """Residuals of the intervals before and after pose i."""
+    """Add the residuals of the intervals before and after pose i."""
     total = 0.0
     base, jacobian = 4 * (i - 1), system.jacobian
     _interval(band, i, v)
@@ -206,7 +206,7 @@ def _pair_terms(
 def _obstacles(
     field: FieldData, cover: CoveringDiscs, parameters: TebParameters, band: Array, i: int, system: NormalEquations
 ) -> float:
-    """Clearance of pose i."""
+    """Add the residuals of the clearance of pose i."""
     total = 0.0
     x, y = band[i, 0], band[i, 1]
     c, s = cos(band[i, 2]), sin(band[i, 2])
@@ -230,7 +230,7 @@ def _assemble(
     direction: Array,
     system: NormalEquations,
 ) -> float:
-    """All residuals at a band; returns the sum of their squares."""
+    """Add all residuals of a band; return the sum of their squares."""
     n = len(band)
     system.matrix[:] = 0.0
     system.gradient[:] = 0.0
@@ -247,7 +247,7 @@ def _assemble(
 
 @njit(cache=True)
 def _solve(matrix: Array, vector: Array) -> bool:
-    """Solve a banded positive definite system in place (Cholesky); False if it is not definite."""
+    """Solve a banded positive definite system in place (Cholesky); return False if it is not definite."""
     n = len(vector)
     for i in range(n):
         first = max(0, i - WIDTH + 1)
@@ -278,7 +278,7 @@ def _solve(matrix: Array, vector: Array) -> bool:
 def optimise(
     field: FieldData, cover: CoveringDiscs, parameters: TebParameters, band: Array, direction: Array, iterations: int
 ) -> tuple[float, int]:
-    """Levenberg-Marquardt steps; the first and the last pose stay.
+    """Execute Levenberg-Marquardt steps; the first and the last pose stay.
 
     Args:
         field: obstacles.
@@ -286,10 +286,10 @@ def optimise(
         parameters: vehicle, limits, weights.
         band: shape (n, 4): x, y, yaw (continuous), seconds of the interval before; changed in place.
         direction: shape (n,), +1 or -1: direction of the interval before.
-        iterations: steps at most.
+        iterations: maximum number of steps.
 
     Returns:
-        Half the sum of squares at the end, and the number of steps that gained.
+        Half the sum of squares at the end, and the number of successful steps.
     """
     n = len(band)
     size = 4 * n
@@ -346,7 +346,7 @@ class TebPlanner:
         self.parameters = teb_parameters(vehicle, self.config)
 
     def plan(self, route: PosePath, obstacles: DistanceField, pose: ArrayLike, state: LocalPlannerState) -> LocalPlan:
-        """One cycle, see ``LocalPlanner``."""
+        """Execute one cycle, see ``LocalPlanner``."""
         cycle = self._core.begin(route, obstacles, pose, state)
         if isinstance(cycle, LocalPlan):
             return cycle
@@ -384,7 +384,7 @@ class TebPlanner:
     def _from_band(
         self, ahead: PosePath, obstacles: DistanceField, robot_pose: Array, statistics: dict[str, float]
     ) -> MotionPath | None:
-        """The band after optimisation; None if it is broken or not free."""
+        """Return the optimised band; None if it is broken or not free."""
         whole = starting_at(ahead, robot_pose)
         if len(whole.poses) < 2:
             return None
@@ -394,7 +394,7 @@ class TebPlanner:
         return self._optimised(whole, obstacles, statistics)
 
     def _optimised(self, poses: PosePath, obstacles: DistanceField, statistics: dict[str, float]) -> MotionPath | None:
-        """Poses after the least squares, as a path, if that is free."""
+        """Return the poses after the least squares as a path, if that is free."""
         even = resampled(poses, self.config.spacing)
         count = len(even.poses)
         band = np.empty((count, 4))
@@ -417,7 +417,7 @@ class TebPlanner:
 
 
 def teb_parameters(vehicle: Vehicle, config: TebConfig) -> TebParameters:
-    """Vehicle and weights for the least squares.
+    """Return vehicle and weights for the least squares.
 
     The axles of a truck that crabs are as far from its reference point as its radius implies; for one that cannot, the
     rear "axle" is the reference point, which moves along the heading, and the front one is a turning radius ahead.
@@ -440,11 +440,11 @@ def teb_parameters(vehicle: Vehicle, config: TebConfig) -> TebParameters:
 
 
 def drivable(vehicle: Vehicle, parameters: TebParameters, band: Array, directions: Array) -> MotionPath:
-    """Path of one exact motion for each interval, from the first pose, within the steering's limits.
+    """Return a path of one exact motion for each interval, from the first pose, within the steering limits.
 
     Args:
         vehicle: body, axles and limits of the robot.
-        parameters: its axles.
+        parameters: parameters of its axles.
         band: shape (n, 4), see ``optimise``.
         directions: shape (n,).
     """
@@ -478,7 +478,7 @@ def turns_soon(path: MotionPath) -> bool:
 
 
 def resampled(path: PosePath, spacing: float) -> PosePath:
-    """The same line with evenly spaced poses; ends and cusps stay."""
+    """Return the same line with evenly spaced poses; ends and cusps stay."""
     poses, directions = [path.poses[:1]], [path.directions[:1]]
     yaw = np.unwrap(path.poses[:, 2])
     for begin, end in direction_runs(path.directions):
