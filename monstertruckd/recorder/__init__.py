@@ -1,1 +1,1 @@
-"""The log: MCAP files of everything on the bus, the black box of every trip, their reading and repair; map pictures."""
+"""Recorder: MCAP logs of the bus, a black box of every gate trip, reading and repair of logs, and map pictures."""

@@ -1,4 +1,4 @@
-"""The folder of black boxes: names, listing, quota."""
+"""Black boxes: files of the minute around a gate trip, with names, a listing and a quota."""
 
 import asyncio
 import errno
@@ -31,13 +31,13 @@ from monstertruckd.recorder.repair import in_use
 from monstertruckd.recorder.ring import Retention, Ring, RingSnapshot
 
 BATCH: Final = 8
-"""Messages written without a pause: they delay the control loop by a fraction of a millisecond."""
+"""Number of messages written without a pause: they delay the control loop by a fraction of a millisecond."""
 LAST_SECONDS: Final = 5.0
-"""Maximum time for writing after the end (s)."""
+"""Maximum time for writing after the end of the context (s)."""
 log = logging.getLogger(__name__)
 
 PART: Final = ".part"
-"""Ends the name of a file that is being written."""
+"""Name suffix of a file that is being written."""
 
 _NAME: Final = re.compile(r"blackbox-(\d{6,})-([a-z_]+)\.mcap")
 
@@ -48,15 +48,15 @@ class BlackBoxFile:
 
     path: Path
     number: int
-    """Counts the folder's boxes over all runs."""
+    """Number of the box, counted over all runs in the folder."""
     reason: str
     """Reason of the trip."""
     size: int
-    """Bytes."""
+    """File size (bytes)."""
 
 
 def black_boxes(directory: Path) -> list[BlackBoxFile]:
-    """The finished black boxes of a folder, oldest first; none if it is not there.
+    """The finished black boxes of a folder, oldest first; empty if the folder is missing.
 
     Raises:
         OSError: the folder cannot be read.
@@ -76,11 +76,11 @@ def black_boxes(directory: Path) -> list[BlackBoxFile]:
 
 
 class BlackBoxFolder:
-    """Names boxes and keeps their sum within a quota. Its methods that touch the disk raise ``OSError``.
+    """Names boxes and keeps their total size within a quota. Methods that access the disk raise ``OSError``.
 
     Args:
-        directory: made when missing.
-        quota: bytes; the latest box of each reason stays even beyond them.
+        directory: folder; created if missing.
+        quota: maximum total size (bytes); the latest box of each reason is always kept.
     """
 
     def __init__(self, directory: Path, quota: int) -> None:
@@ -100,14 +100,14 @@ class BlackBoxFolder:
                 log.warning("%s, which an earlier run left, cannot be removed: %s", path, error.strerror)
 
     def next_name(self, reason: Reason) -> str:
-        """Name of the next box; touches nothing."""
+        """Return the name of the next box, without access to the disk."""
         self._number += 1
         return f"blackbox-{self._number:06d}-{reason.value}.mcap"
 
     def begin(self, name: str) -> str:
-        """The name the box gets: ``name`` or, where that is taken, one of the folder's next number.
+        """Return the final name of a box: ``name`` or, if it is taken, a name with the next number.
 
-        It is taken if the folder could not be read at the start, or if another daemon writes there as well.
+        The name may be taken if the folder could not be read at the start, or if another daemon writes there.
         """
         make_folder(self.directory)
         while self._is_taken(name):
@@ -121,7 +121,7 @@ class BlackBoxFolder:
         return self.directory / (name + PART)
 
     def finish(self, name: str) -> None:
-        """Give the complete box its name, durably, and remove old ones beyond the quota."""
+        """Give the complete box its name, synced to disk, and remove old boxes beyond the quota."""
         self.part(name).replace(self.directory / name)
         sync_folder(self.directory)
         self._keep_quota()
@@ -148,7 +148,7 @@ class BlackBoxFolder:
 
 @dataclass(slots=True)
 class _Pending:
-    """A box that will be written once its time has come."""
+    """Box that is written once its time has come."""
 
     name: str
     reason: Reason
@@ -157,7 +157,7 @@ class _Pending:
 
     @property
     def what(self) -> str:
-        """Content."""
+        """Description of the content."""
         if len(self.trips) == 1:
             return f"the minute before stop {self.trips[0].number} is"
         return f"stops {', '.join(str(trip.number) for trip in self.trips)} are"
@@ -167,19 +167,19 @@ class BlackBox:
     """Keeps the latest messages in memory and writes them when the gate trips; runs while its ``async with`` body does.
 
     Every trip is in a box: a new one, the box of a trip shortly before, or, within ``interval`` of a box for the same
-    reason, a later one. A box that waits when the body ends is written before the context is left, unless that takes
-    longer than ``LAST_SECONDS``. A disk that is full, refuses or is too slow loses the box, which is reported, and has
+    reason, a later one. When the body ends, pending boxes are written before the context exits, unless that takes
+    longer than ``LAST_SECONDS``. If the disk is full, fails or is too slow, the box is lost; this is reported and has
     no other effect.
 
     Args:
         config: spans and limits.
-        directory: where the boxes go.
+        directory: folder of the boxes.
         clock: daemon time.
-        events: where saved and lost boxes are reported.
-        attachments: JSON-able values in every box, as ``<name>.json``.
+        events: sink for saved and lost boxes.
+        attachments: JSON-serialisable values in every box, as ``<name>.json``.
         metadata: text about the run, in every box.
-        offload: where boxes are written.
-        log: file of the run that is being written, named in every box.
+        offload: runs the writing of boxes.
+        log: current log file of the run, named in every box.
     """
 
     name = ServiceName.BLACKBOX.value
@@ -250,30 +250,29 @@ class BlackBox:
             await asyncio.wait((self._taking, self._saving))
 
     def freeze(self) -> None:
-        """Take the content of the waiting boxes now, before the end; they are written when the context is left."""
+        """Take the content of the pending boxes now, before the end; they are written when the context exits."""
         self._frozen += [(pending, self.ring.snapshot()) for pending in self._pending]
         self._pending.clear()
         self._wake.set()
 
     def record(self, topic: Topic[Any], stamp: int, payload: bytes, at: int | None = None) -> None:
-        """Remember one encoded message.
+        """Store one encoded message.
 
         Args:
-            topic: its entry of the topic table.
-            stamp: the message's own stamp (ns).
-            payload: its bytes on the wire.
-            at: when it was published (ns); None: now.
+            topic: entry of the topic table.
+            stamp: stamp of the message (ns).
+            payload: encoded message.
+            at: time of publication (ns); None for now.
         """
         sequence = self._sequences[topic.name]
         self._sequences[topic.name] = sequence + 1
         self.ring.add(LogEntry(topic, self._clock.now() if at is None else at, stamp, sequence, payload))
 
     def trip(self, trip: Stop) -> str | None:
-        """Note a trip of the gate.
+        """Register a trip of the gate.
 
         Returns:
-            The name its box will have, which it may share with other trips; None if for this reason boxes are not
-            wanted.
+            Name of its future box, which may contain other trips; None if this reason writes no box.
         """
         if trip.reason in self._config.unless:
             return None
@@ -288,7 +287,7 @@ class BlackBox:
         return pending.name
 
     def _allowed(self, trip: Stop) -> int:
-        """Earliest time of another box of this trip's reason; never so late that it would miss the trip."""
+        """Return the earliest time of another box for this reason, while it would still contain the trip."""
         last = self._last.get(trip.reason)
         if last is None:
             return trip.stamp
@@ -296,13 +295,13 @@ class BlackBox:
         return min(last + interval, trip.stamp + before)
 
     async def _take(self) -> None:
-        """Take each box's content at the instant it is due, whatever the disk is doing."""
+        """Take the content of each box when it is due, whatever the state of the disk."""
         while not self._closing:
             pending = min(self._pending, key=attrgetter("due"), default=None)
             if not await self._is_due(pending) or pending not in self._pending:
                 continue
             self._pending.remove(pending)
-            if self._taken.qsize() < 2:  # boxes that may wait for a slow disk, with the memory they take
+            if self._taken.qsize() < 2:  # maximum number of boxes waiting for a slow disk, because they take memory
                 self._taken.put_nowait((pending, self.ring.snapshot()))
             else:
                 slow = TimeoutError(errno.ETIMEDOUT, "the disk is too slow")
@@ -310,7 +309,7 @@ class BlackBox:
         self._taken.put_nowait(None)
 
     async def _is_due(self, pending: _Pending | None) -> bool:
-        """Wait until ``pending`` is due (True), or there is news (False)."""
+        """Wait until ``pending`` is due (True), or another trip arrives (False)."""
         self._wake.clear()
         if pending is None:
             return not await self._wake.wait()
@@ -362,13 +361,13 @@ class BlackBox:
         self._events(disk_reason(error), Severity.WARNING, self.name, f"{what}: {error.strerror or error}")
 
     def _write(self, name: str, entries: RingSnapshot, metadata: Mapping[str, str], offset: int) -> str:
-        """Write a box in a thread, pausing for the control loop unless the daemon ends; return the box's name."""
+        """Write a box in a thread, with pauses for the control loop unless the daemon ends; return its name."""
         offloaded = threading.get_ident() != self._loop_thread
         name = self._folder.begin(name)
         part = self._folder.part(name)
         start = next((entry.log_time for entry in entries), 0)
         try:
-            # 64 * 1024: bytes compressed at once; more takes longer
+            # 64 * 1024: maximum number of bytes compressed at once
             file = LogFile(part, Compression.ZSTD, 64 * 1024, self._attachments, metadata, start, offset)
             try:
                 for count, entry in enumerate(entries):

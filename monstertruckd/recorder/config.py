@@ -80,6 +80,6 @@ class MapRender(Schema):
     period: Annotated[float, Field(ge=0.1, le=60)] = 0.5
     """Interval between the scans passed to the worker (s)"""
     max_tilt: Annotated[float, Field(gt=0, le=math.pi / 2)] = math.radians(3)
-    """Maximum tilt of a scan (rad), else it is left out; the default is an error of 0.26 m at 5 m"""
+    """Maximum tilt of a scan (rad); scans beyond it are skipped. The default is an error of 0.26 m at 5 m"""
     picture: Path | None = None
     """PNG file, drawn whenever a path has ended"""

@@ -74,7 +74,7 @@ PRIVATE: Final = 0x80
 
 
 def is_finished(path: Path) -> bool:
-    """Whether the file ends as a finished log does."""
+    """Whether the file ends like a finished log."""
     with path.open("rb") as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(-min(size, len(MAGIC)), os.SEEK_END)
@@ -113,7 +113,7 @@ def read_frame(file: BinaryIO, size: int) -> tuple[int, bytes, bytes]:
 
     Raises:
         EndOfFile: the record is cut off.
-        McapError: it is longer than ``MOST_UNPACKED``.
+        McapError: the record is longer than ``MOST_UNPACKED``.
     """
     head = file.read(HEAD.size)
     if len(head) < HEAD.size:
@@ -158,7 +158,7 @@ def checked_attachment(record: Attachment, content: bytes) -> Attachment:
 
 
 def open_file(path: Path) -> BinaryIO:
-    """Open a log for reading, without a look at its content.
+    """Open a log for reading, without checking its content.
 
     Raises:
         NotFoundError: no such file.

@@ -8,7 +8,7 @@ from monstertruckd.recorder.salvage import Salvage
 
 @dataclass(frozen=True, slots=True)
 class LogDamage:
-    """Damage of a log that was read to its end."""
+    """Result of reading a damaged log to its end."""
 
     messages: int
     """Messages kept."""
@@ -56,7 +56,7 @@ def repetition(chunks: int) -> str:
 
 
 def judged(salvage: Salvage) -> LogDamage:
-    """Return the damage that a salvage met, once all its records were read."""
+    """Return the damage found by a salvage after all records were read."""
     spans = salvage.spans()
     begin = min((time for time in (salvage.first, *(span.start for span in spans)) if time is not None), default=0)
     damage = list(salvage.flaws)

@@ -1,4 +1,4 @@
-"""Worker that gathers scans and draws paths over them: ``monstertruckd.recorder.picture_worker:MapRenderer``.
+"""Worker that accumulates scans and draws paths over them: ``monstertruckd.recorder.picture_worker:MapRenderer``.
 
 A step's inputs are a dict:
 
@@ -6,7 +6,7 @@ A step's inputs are a dict:
   sensor's frame (m);
 - ``render``: absent, or what to draw: ``title``, ``subtitle`` and ``paths``, a list of dicts with ``name``, ``poses``
   (shape (n, 2) or (n, 3), map frame) and ``style``, a key of ``STYLES``;
-- ``file``: where to save the picture; the file appears complete or not at all.
+- ``file``: path of the picture, which is written atomically.
 
 Its outputs are a dict: ``scans``, the number of scans added since the start, and for a picture ``png`` (or ``error``,
 why it could not be saved).
@@ -29,7 +29,7 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class Style:
-    """How a path is drawn; widths in final pixels."""
+    """Drawing style of a path; widths in final pixels."""
 
     color: str
     width: float
@@ -49,7 +49,7 @@ _MARGIN, _HEAD, _FOOT = 28, 84, 64
 
 
 class MapRenderer:
-    """The worker; see the module's text."""
+    """The worker; see the module docstring."""
 
     def __init__(self) -> None:
         self._raster = OccupancyRaster()
@@ -156,7 +156,7 @@ class _Frame:
 
 
 def _shown(raster: OccupancyRaster, paths: list[Array]) -> Area:
-    """Everything seen and driven, with some room around it."""
+    """Return the area of everything seen and driven, with a margin."""
     seen = ~np.isnan(raster.occupancy())
     corners = [path[:, :2] for path in paths]
     if seen.any():
@@ -164,13 +164,13 @@ def _shown(raster: OccupancyRaster, paths: list[Array]) -> Area:
         cells = np.array([[columns[0], rows[0]], [columns[-1] + 1, rows[-1] + 1]])
         corners.append(np.array([raster.area.x0, raster.area.y0]) + cells * raster.cell)
     points = np.vstack(corners) if corners else np.array([[-1.0, -1.0], [1.0, 1.0]])
-    around = 0.4  # metres shown around everything that was seen or driven
+    around = 0.4  # margin around the area, m
     (x0, y0), (x1, y1) = points.min(axis=0) - around, points.max(axis=0) + around
     return Area(float(x0), float(y0), float(x1), float(y1))
 
 
 def _background(raster: OccupancyRaster, frame: _Frame) -> Image.Image:
-    """The raster in shades from free over unknown to wall, as large as the map."""
+    """Draw the raster in shades from free over unknown to wall, at the size of the map."""
     occupancy = raster.occupancy()
     wall = np.clip(np.nan_to_num(occupancy) * 2.0, 0.0, 1.0)[..., None]
     shades = np.where(np.isnan(occupancy)[..., None], _UNKNOWN, _FREE + (_WALL - _FREE) * wall)
@@ -185,7 +185,7 @@ def _background(raster: OccupancyRaster, frame: _Frame) -> Image.Image:
 
 
 def _rule(canvas: Image.Image, frame: _Frame) -> None:
-    """Faint lines at round metres, behind the walls."""
+    """Draw faint lines at round metres, behind the walls."""
     area, step = frame.area, frame.unit
     for x in np.arange(np.ceil(area.x0 / step), np.floor(area.x1 / step) + 1) * step:
         at = round((x - area.x0) * frame.scale)
@@ -210,7 +210,7 @@ def _line(pen: ImageDraw.ImageDraw, points: list[Point], style: Style) -> None:
 
 
 def _dashes(points: Array, length: float) -> list[Array]:
-    """Pieces of a polyline, ``length`` long, with gaps of 0.7 ``length`` between them."""
+    """Return the pieces of a dashed polyline, each ``length`` long, with gaps of 0.7 ``length``."""
     if len(points) < 2:
         return []
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
@@ -223,7 +223,7 @@ def _dashes(points: Array, length: float) -> list[Array]:
 
 
 def _ends(pen: ImageDraw.ImageDraw, frame: _Frame, poses: Array, style: Style) -> None:
-    """A ring where the path begins, an arrow where it ends if it has headings."""
+    """Draw a ring at the start of a path, and an arrow at its end if it has headings."""
     x, y = frame.pixel(*poses[0, :2])
     radius = 6 * _OVERSAMPLING
     pen.ellipse(

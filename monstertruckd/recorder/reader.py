@@ -45,7 +45,7 @@ CONFIG: Final = "config.json"
 
 
 def spare_log(output: Path) -> None:
-    """Refuse to overwrite a log.
+    """Raise an error if ``output`` is a log, which must not be overwritten.
 
     Raises:
         InputError: ``output`` is a log.
@@ -98,7 +98,7 @@ class LogMessage:
 
 
 class LogReader:
-    """Iterates over a log, any number of times; over every intact chunk of a damaged file, as ``recover`` keeps them.
+    """Iterates over a log, any number of times; of a damaged file, over every intact chunk, like ``recover``.
 
     Args:
         path: MCAP file.
@@ -111,7 +111,9 @@ class LogReader:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.damage: str | None = None
-        """After a complete iteration: why messages are missing, how many and when; None if none are known to be."""
+        """Reason, number and times of missing messages, after a complete iteration; None if none are known to be
+        missing.
+        """
         self.flaws: list[str] = []
         """Other damage found by a complete iteration, which loses no message."""
         self.verdict: LogDamage | None = None
@@ -296,7 +298,7 @@ class LogReader:
 
     @property
     def fault(self) -> str | None:
-        """All damage found by a complete iteration, phrased to follow the log's name; None for an undamaged log."""
+        """All damage found by a complete iteration, as text to follow the log's name; None for an undamaged log."""
         return ", ".join([*self.flaws, *([] if self.damage is None else [self.damage])]) or None
 
     @property
@@ -319,7 +321,7 @@ def _resembles(head: bytes) -> bool:
 
 
 def _introduction(number: int, facts: ChannelFacts) -> Iterator[Schema | Channel]:
-    """Yield a channel that may not have been introduced yet, and its schema under a number that no file can hold."""
+    """Yield a channel that may not have been introduced yet, and its schema with a number that no file uses."""
     schema = 0
     if facts.schema is not None:
         schema = (1 << 16) + number  # schema numbers in a file are lower

@@ -1,1 +1,1 @@
-"""The robot as a ROS 2 node: a separate process with a client of the robot on one side and ROS 2 on the other."""
+"""The robot as a ROS 2 node: a separate process that connects a client of the robot with ROS 2."""

@@ -1,8 +1,8 @@
-"""Action servers of ROS 2 for the robot's tasks, for any action type.
+"""ROS 2 action servers for the robot's tasks, for any action type.
 
-An action has one edition for each set of fields that the distributions know. All editions of the node's distributions
-are served at once: where their hashes differ, they are different services and topics on the wire. A goal that the robot
-refuses is accepted first and then aborted: only a result has room for the reason.
+An action has one edition for each set of fields among the distributions. The node serves all editions of its
+distributions at once: editions with different hashes are different services and topics on the wire. A goal that the
+robot refuses is accepted and then aborted, because only a result can carry the reason.
 """
 
 import asyncio
@@ -26,7 +26,7 @@ from monstertruckd.ros2.operators import Operators, stamp_of
 from monstertruckd.ros2.rmw import LATCHED, RELIABLE
 
 FAILED: Final = 9000
-"""``error_code`` of a goal that failed; ``error_msg`` gives the reason."""
+"""``error_code`` of a failed goal; ``error_msg`` contains the reason."""
 
 W = TypeVar("W")
 
@@ -44,7 +44,7 @@ class GoalStatus(IntEnum):
 
     @property
     def ended(self) -> bool:
-        """Whether it never changes again."""
+        """Whether the status is final."""
         return self >= GoalStatus.SUCCEEDED
 
 
@@ -62,20 +62,20 @@ class ActionGoal(Generic[W]):
     """One goal."""
 
     number: bytes
-    """Its UUID."""
+    """UUID of the goal."""
     stamp: int
-    """When it was accepted, real time (ns)."""
+    """Real time of acceptance (ns)."""
     work: W
-    """Goal in the terms of the robot."""
+    """Goal as the robot executes it."""
     status: GoalStatus = GoalStatus.ACCEPTED
     text: str = ""
-    """Why it failed."""
+    """Reason of the failure."""
     ended: asyncio.Event = field(default_factory=asyncio.Event)
     task: asyncio.Task[None] | None = None
 
 
 class RobotAction(ABC, Generic[W]):
-    """Execution of the goals of one action; ``W`` is a goal as the robot understands it."""
+    """Executes the goals of one action; ``W`` is the robot's type of a goal."""
 
     name: ClassVar[str]
     interface: ClassVar[str]
@@ -85,35 +85,35 @@ class RobotAction(ABC, Generic[W]):
         """Return the converted goal.
 
         Raises:
-            InputError: the robot could misunderstand it.
+            InputError: the goal is invalid or ambiguous for the robot.
         """
 
     @abstractmethod
     async def drive(self, driver: TruckClient, work: W, show: Callable[[RosValues], None]) -> tuple[Reason, str]:
-        """Have the robot do it; returns the outcome and its text. A cancelled one stops the robot's task.
+        """Execute a goal; return the outcome and its text. Cancellation stops the robot's task.
 
         Args:
             driver: session of the node that sent the goal.
-            work: of ``read``.
-            show: gets feedback, with the fields of all editions.
+            work: result of ``read``.
+            show: publishes feedback, with the fields of all editions.
 
         Raises:
-            TruckError: refused, or no answer.
+            TruckError: the robot refuses or does not answer.
         """
 
     def result(self, work: W, status: GoalStatus) -> RosValues:
-        """Return fields of the result besides ``error_code`` and ``error_msg``."""
+        """Return the fields of the result other than ``error_code`` and ``error_msg``."""
         return {}
 
 
 def within(interface: str, values: Mapping[str, Any]) -> RosValues:
-    """Values of the fields that an edition has."""
+    """Return the values of the fields that an edition has."""
     names = {own.name for own in interfaces()[interface]}
     return {name: value for name, value in values.items() if name in names}
 
 
 def chosen(goals: Mapping[bytes, ActionGoal[W]], number: bytes, stamp: int) -> tuple[CancelCode, list[ActionGoal[W]]]:
-    """Goals that a request to cancel means: one, all until a time, or all.
+    """Return the goals that a cancel request selects: one, all accepted until a time, or all.
 
     Args:
         goals: goals by UUID.
@@ -141,7 +141,7 @@ class ActionServer(Generic[W]):
         action: execution of its goals.
         node: node of ROS 2.
         operators: sessions of the nodes that send goals.
-        active: whether goals are accepted at present.
+        active: returns whether goals are currently accepted.
         clock: time.
     """
 
@@ -168,7 +168,7 @@ class ActionServer(Generic[W]):
             node.serve(f"{place}/get_result", f"{edition}_GetResult", answer)
 
     def close(self) -> None:
-        """Give up all goals."""
+        """Cancel all goals."""
         for goal in self._goals.values():
             if goal.task is not None:
                 goal.task.cancel()

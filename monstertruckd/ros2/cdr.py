@@ -1,7 +1,7 @@
-"""CDR, the encoding of ROS 2 messages (XCDR1, little endian): messages are dictionaries of the interface's fields.
+"""CDR, the encoding of ROS 2 messages (XCDR1, little endian): a message is a dictionary of the interface's fields.
 
-A field that is left out is zero or empty. Sequences of numbers are arrays of numpy, or bytes; decoded ones are
-read-only. A decoder refuses what it cannot read; it never reserves more memory than the message has bytes.
+An omitted field is zero or empty. Sequences of numbers are numpy arrays, or bytes; decoded ones are read-only. The
+decoder rejects invalid data and never allocates more memory than the size of the message.
 """
 
 import math
@@ -16,10 +16,10 @@ from monstertruck_runtime.errors import InputError
 from monstertruckd.ros2.interfaces import ARRAY, RosField, interfaces
 
 RosMessage = dict[str, Any]
-"""Values by field; those of nested interfaces are dictionaries, too."""
+"""Values by field; values of nested interfaces are dictionaries as well."""
 
 HEADER: Final = b"\x00\x01\x00\x00"
-"""Little endian, no options; alignment is counted from behind it."""
+"""Little endian, no options; alignment starts after this header."""
 
 _CODES: Final = {
     "bool": "?",
@@ -36,11 +36,11 @@ _CODES: Final = {
     "float32": "f",
     "float64": "d",
 }
-"""Formats of ``struct`` and, but for ``?`` and its kin, of numpy."""
+"""Format characters of ``struct``, also used for numpy except ``?`` and similar ones."""
 
 Write = Callable[[bytearray, Any], None]
 Read = Callable[[memoryview, int], tuple[Any, int]]
-"""Reads a value at an offset; returns it and the offset behind it."""
+"""Reads a value at an offset; returns it and the offset after it."""
 
 _EMPTY: Final[RosMessage] = {}
 _COUNT: Final = struct.Struct("<I")
@@ -48,10 +48,10 @@ _FLOAT32: Final = struct.Struct("<f")
 
 
 def encode(name: str, message: Mapping[str, Any]) -> bytes:
-    """A message as bytes, header included.
+    """Encode a message, including the header.
 
     Raises:
-        ValueError: it has a field that the interface does not have, or an array of another length.
+        ValueError: the message has an unknown field or an array of the wrong length.
         struct.error: a number does not fit its field.
     """
     body = bytearray()
@@ -60,10 +60,10 @@ def encode(name: str, message: Mapping[str, Any]) -> bytes:
 
 
 def decode(name: str, data: bytes) -> RosMessage:
-    """A message of its bytes.
+    """Decode a message.
 
     Raises:
-        InputError: they are none of this interface; bytes behind its end are ignored, as ROS 2 does.
+        InputError: the bytes do not match the interface; bytes after its end are ignored, as in ROS 2.
     """
     if data[:2] != HEADER[:2]:
         raise InputError(f"{name}: expected little-endian CDR, found {data[:4].hex() or 'no data'}")
@@ -104,7 +104,7 @@ def _struct_writer(name: str) -> Write:
 
 
 def _packed_writer(fields: tuple[RosField, ...]) -> Write | None:
-    """Writer of an interface that is a row of numbers of one size, such as a point; None for any other."""
+    """Return a writer for an interface whose fields are numbers of one size, such as a point; None for any other."""
     kinds = {field.kind for field in fields}
     sizes = {struct.calcsize(_CODES.get(kind, "0s")) for kind in kinds}
     if len(sizes) > 1 or not kinds <= _CODES.keys() or "float32" in kinds or any(field.many for field in fields):
@@ -180,7 +180,7 @@ def _writer(field: RosField) -> Write:
 
 
 def _write_float32(body: bytearray, value: float) -> None:
-    """Values beyond the range of 32 bits become infinite, as numpy makes it in arrays."""
+    """Write a float32; values beyond its range become infinite, as in numpy arrays."""
     _pad(body, _FLOAT32.size)
     try:
         body += _FLOAT32.pack(value)

@@ -1,6 +1,6 @@
-"""Messages of the robot as messages of ROS 2, in ROS's conventions (REP 103, 105, 117 and 145).
+"""Conversion of the robot's messages to ROS 2 messages, by ROS conventions (REP 103, 105, 117 and 145).
 
-Values are dictionaries by field, as ``cdr.encode`` takes them. Stamps and names of frames are given by ``RosNames``.
+Values are dictionaries by field, for ``cdr.encode``. ``RosNames`` converts stamps and frame names.
 """
 
 import math
@@ -36,11 +36,11 @@ from monstertruck_schemas.zones import Zones
 RosValues = dict[str, Any]
 
 FRAMES: Final = {"base": "base_link", "lidar": "laser", "lidar_2": "laser_2"}
-"""Frames that ROS calls otherwise."""
+"""Frames with other names in ROS."""
 
 
 FOOTPRINT: Final = "base_footprint"
-"""Projection of base onto the ground, which base is on already."""
+"""Projection of base onto the ground; identical to base on this robot."""
 
 
 def _own_name(frame: str) -> str:
@@ -49,15 +49,15 @@ def _own_name(frame: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class RosNames:
-    """How stamps and frames are written."""
+    """Conversion of stamps and frame names."""
 
     offset: int = 0
     """Real time minus robot time (ns)."""
     frame: Callable[[str], str] = _own_name
-    """Name of a frame of the robot."""
+    """Returns the ROS name of a frame of the robot."""
 
     def time(self, stamp: int) -> RosValues:
-        """``builtin_interfaces/msg/Time`` of the robot's time; later times become the end of the format, in 2038."""
+        """``builtin_interfaces/msg/Time`` for the robot's time, limited to the end of the format in 2038."""
         last = 2**31 * SECOND - 1  # last time that a ``builtin_interfaces/msg/Time`` can hold, ns
         seconds, nanoseconds = divmod(min(max(0, stamp + self.offset), last), SECOND)
         return {"sec": seconds, "nanosec": nanoseconds}
@@ -72,7 +72,7 @@ class RosNames:
 
 
 def prefixed(prefix: str) -> Callable[[str], str]:
-    """Names of ROS 2 for the robot's frames, behind a prefix such as ``truck1/``."""
+    """Return the conversion of the robot's frame names to ROS names with a prefix such as ``truck1/``."""
     return lambda frame: f"{prefix}{FRAMES.get(frame, frame)}"
 
 
@@ -92,7 +92,7 @@ def pose_of(pose: Pose2D, z: float = 0.0) -> RosValues:
 
 
 _PLANE: Final = np.array([6 * row + column for row in (0, 1, 5) for column in (0, 1, 5)])
-"""Places of (x, y, yaw) in ROS's covariances over (x, y, z, roll, pitch, yaw)."""
+"""Indices of (x, y, yaw) in ROS covariances over (x, y, z, roll, pitch, yaw)."""
 
 
 def full_covariance(planar: Array) -> Array:
@@ -103,8 +103,8 @@ def full_covariance(planar: Array) -> Array:
 
 
 def scan(message: LaserScan, names: RosNames) -> RosValues:
-    """``sensor_msgs/msg/LaserScan``: +inf where a beam met nothing, NaN where the sensor does not know (REP 117)."""
-    with np.errstate(over="ignore"):  # beyond the range of 32 bits is infinite
+    """``sensor_msgs/msg/LaserScan``: +inf without a return in range, NaN for an unknown range (REP 117)."""
+    with np.errstate(over="ignore"):  # values beyond the range of float32 become infinite
         ranges = message.ranges.astype(np.float32)
     ranges[(message.codes > NO_ECHO) & (message.codes != VALID_BEAM)] = np.nan
     return {
@@ -161,7 +161,7 @@ def image(message: CompressedImage, names: RosNames) -> RosValues:
 
 
 def camera_info(message: CompressedImage, lens: LensConfig, names: RosNames) -> RosValues:
-    """``sensor_msgs/msg/CameraInfo``: a pinhole with the distortion of Brown, as the lens is calibrated."""
+    """``sensor_msgs/msg/CameraInfo``: pinhole with Brown distortion, as in the lens calibration."""
     fx, fy, cx, cy = lens.focal_x, lens.focal_y, lens.centre_x, lens.centre_y
     return {
         "header": names.header(message),
@@ -188,7 +188,7 @@ def grid(message: Grid, names: RosNames) -> RosValues:
 
 
 def ground(message: Ground, names: RosNames) -> RosValues:
-    """``nav_msgs/msg/OccupancyGrid`` of the ground's tilt in degrees, at most 100; -1 where it is not known."""
+    """``nav_msgs/msg/OccupancyGrid`` of the ground's tilt in degrees, at most 100; -1 if unknown."""
     degrees = np.minimum(np.rint(np.degrees(message.tilt * TILT_STEP)), 100)
     cells = np.where(message.tilt == 255, -1, degrees).astype(np.int8)  # 255: not known
     info = {
@@ -215,7 +215,7 @@ def grid_update(tile: Grid, whole: Grid, names: RosNames) -> RosValues | None:
 
 
 def path(message: Path, names: RosNames) -> RosValues:
-    """``nav_msgs/msg/Path``; directions and steering have no place in it."""
+    """``nav_msgs/msg/Path``, which has no fields for direction and steering."""
     header = names.header(message)
     rows = message.poses.reshape(-1, 3).tolist()
     return {
@@ -262,7 +262,7 @@ def imu(message: Imu, names: RosNames) -> RosValues:
 
 
 def compass(message: Attitude, names: RosNames) -> RosValues:
-    """``sensor_msgs/msg/Imu`` with an orientation from magnetic east, as REP 145 asks, and no angular velocity."""
+    """``sensor_msgs/msg/Imu`` with an orientation from magnetic east, as REP 145 requires, and no angular velocity."""
     yaw = math.remainder(math.pi / 2.0 - message.heading, math.tau)
     acceleration = message.acceleration
     return {
@@ -289,7 +289,7 @@ def sonar(echo: SonarEcho, message: SonarRanges, names: RosNames) -> RosValues:
 
 
 def joint_states(stamp: int, angles: Mapping[str, float], names: RosNames) -> RosValues:
-    """``sensor_msgs/msg/JointState`` of angles, rad, by joint of the robot's description."""
+    """``sensor_msgs/msg/JointState`` of angles (rad), by joint of the robot description."""
     header = {"stamp": names.time(stamp), "frame_id": ""}
     return {"header": header, "name": list(angles), "position": list(angles.values())}
 
@@ -306,7 +306,7 @@ SEVERITIES: Final = {Severity.INFO: 20, Severity.WARNING: 30, Severity.ERROR: 40
 
 
 def event(message: Event, names: RosNames) -> RosValues:
-    """``rcl_interfaces/msg/Log`` of an event: its reason, its text and the values behind it."""
+    """``rcl_interfaces/msg/Log`` of an event: its reason, text and values."""
     values = "".join(f", {name} {value}" for name, value in message.values.items())
     return {
         "stamp": names.time(message.stamp),
@@ -430,7 +430,7 @@ def zone_markers(message: Zones, names: RosNames) -> RosValues:
 def task_markers(
     goal: GoalState | None, exploration: ExplorationState | None, peers: Peers | None, names: RosNames
 ) -> RosValues:
-    """``visualization_msgs/msg/MarkerArray`` of the goal, the frontier that is explored next, and other robots."""
+    """``visualization_msgs/msg/MarkerArray`` of the goal, the next frontier to explore, and other robots."""
     rows: list[tuple[str, str, Message, Pose2D, tuple[float, ...]]] = []
     if goal is not None and goal.running and goal.goal is not None:
         rows.append(("goal", "", goal, goal.goal, (0.2, 0.4, 0.9, 0.9)))
@@ -453,13 +453,13 @@ def task_markers(
 
 
 def outline(length: float, width: float) -> list[RosValues]:
-    """Corners of the robot's rectangle around base (m)."""
+    """Return the corners of the robot's footprint around base (m)."""
     x, y = length / 2.0, width / 2.0
     return [vector(*corner) for corner in ((x, y), (-x, y), (-x, -y), (x, -y))]
 
 
 def gate_markers(gate: GateState, length: float, width: float, names: RosNames) -> RosValues:
-    """``visualization_msgs/msg/MarkerArray`` of the robot's footprint, red while it is stopped, and where it stops."""
+    """``visualization_msgs/msg/MarkerArray`` of the robot's footprint, red while stopped, and its stopping point."""
     header = {"frame_id": names.frame("base")}  # stamp 0: where the robot is now
     free = gate.mode in (GateMode.ARMED, GateMode.DRIVING)
     colour = (0.2, 0.8, 0.3, 1.0) if free else (0.9, 0.2, 0.2, 1.0)

@@ -1,4 +1,4 @@
-"""The robot on a ROS 2 node: its topics outwards, requests of ROS 2 nodes inwards."""
+"""The robot on a ROS 2 node: publishes its topics and accepts requests of ROS 2 nodes."""
 
 import asyncio
 import math
@@ -42,27 +42,27 @@ from monstertruckd.ros2.parameters import RosParameters
 from monstertruckd.ros2.rmw import LATCHED, RELIABLE, SENSOR, RosQos
 
 TF: Final = RosQos(depth=100)
-"""Quality of service of ``/tf``, as ``tf2_ros`` has it."""
+"""Quality of service of ``/tf``, as in ``tf2_ros``."""
 ROSOUT: Final = RosQos(depth=1000, latched=True)
 """Quality of service of ``/rosout``, as in ``rcl``."""
 ORDERS: Final = (Order.ARM, Order.DISARM, Order.RESET, Order.ESTOP, Order.STOP)
-"""Orders that are services of the node."""
+"""Orders offered as services of the node."""
 
 
 @dataclass(frozen=True, slots=True)
 class FaceOptions:
-    """Choices of the user."""
+    """Options of the user."""
 
     prefix: str = ""
-    """Before the name of every frame, such as ``truck1/``."""
+    """Prefix of every frame name, such as ``truck1/``."""
     map_to_odom: bool = True
-    """Whether the robot's localisation is published; False where ROS 2 localises."""
+    """Whether to publish the robot's localisation; False if ROS 2 localises it."""
     odom_to_base: bool = True
-    """Whether its odometry is published as transform; False where ROS 2 fuses it."""
+    """Whether to publish the odometry as a transform; False if ROS 2 fuses it."""
     clock: bool = False
-    """Publish ``/clock``."""
+    """Whether to publish ``/clock``."""
     drives: bool = True
-    """Whether ROS 2 nodes may ask for anything but an emergency stop."""
+    """Whether ROS 2 nodes may request anything but an emergency stop."""
 
 
 class RosFace:
@@ -71,9 +71,9 @@ class RosFace:
     Args:
         client: client of the robot.
         node: node of ROS 2.
-        operators: sessions of the nodes that ask for something.
+        operators: sessions of the nodes that send requests.
         facts: facts of the robot's configuration.
-        options: as chosen.
+        options: options of the user.
         clock: time.
     """
 
@@ -95,19 +95,19 @@ class RosFace:
         self._names = convert.RosNames(0, convert.prefixed(options.prefix))
         self._publishers: dict[tuple[str, str], Callable[[Mapping[str, Any]], None]] = {}
         self._odometry = False
-        """Whether there is dead reckoning: it moves base in odom more often than the frame tree does."""
+        """Whether dead reckoning exists: it updates base in odom more often than the frame tree."""
         self._fixed: list[Any] = []
-        """Fixed transforms as published last."""
+        """Fixed transforms last published."""
         self._localisation: RosLocalisation | None = None
         self._map: Grid | None = None
         self._steering: SteeringFeedback | None = None
         self._stabiliser: StabiliserFeedback | None = None
 
     async def run(self, ready: Callable[[], object] = lambda: None) -> None:
-        """Serve until cancelled; ``ready`` is called once ROS 2 sees the robot.
+        """Serve until cancelled; calls ``ready`` once ROS 2 can discover the robot.
 
         Raises:
-            NoAnswerError: the robot does not say what time it has.
+            NoAnswerError: the robot does not publish its clock.
         """
         clock = self._client.subscribe(t.CLOCK, fifo(10))
         try:
@@ -143,7 +143,7 @@ class RosFace:
             take(message)
 
     def _publish(self, topic: str, interface: str, values: Mapping[str, Any], qos: RosQos = RELIABLE) -> None:
-        """Publish; a topic is offered with its first message, so ROS 2 lists only topics that this robot has."""
+        """Publish; the first message of a topic declares it, so that ROS 2 lists only topics that this robot has."""
         publish = self._publishers.get((topic, interface))
         if publish is None:
             publish = self._publishers[topic, interface] = self._node.publisher(topic, interface, qos)
@@ -152,7 +152,7 @@ class RosFace:
     # Outwards
 
     def _rows(self) -> Iterable[tuple[Topic[Any], Callable[[Any], None]]]:
-        """Topics of the robot with the handlers of their messages."""
+        """Yield the robot's topics with the handlers of their messages."""
         return (
             (t.SCAN, self._scan),
             (t.SCAN_2, partial(self._scan, topic="scan_2")),
@@ -303,7 +303,7 @@ class RosFace:
         self._publish("zones", "visualization_msgs/msg/MarkerArray", values, LATCHED)
 
     async def _diagnose(self) -> None:
-        """Once a second: the state of services, gate and this face, and the footprint."""
+        """Publish once per second the state of services, gate and this node, and the footprint."""
         watch = self._client.watch
         gate, health = watch(t.GATE), watch(t.HEALTH)
         goal, exploration, peers = watch(t.GOAL), watch(t.EXPLORE), watch(t.PEERS)
@@ -372,7 +372,7 @@ class RosFace:
         return await _outcome(client.order(order))
 
     def _estop(self, arrival: RosArrival) -> None:
-        """Pass on an emergency stop; it is never refused, regardless of its sender and age."""
+        """Forward an emergency stop; it is never refused, regardless of its sender and age."""
         node = "an unknown publisher" if arrival.sender is None else arrival.sender.node
         self._operators.run(node, "estop", self._client.order(Order.ESTOP))
 
@@ -418,10 +418,10 @@ class RosFace:
             self._operators.ask(sender, "goal_pose", lambda client: client.goal(pose, frame))
 
     def _goal_in(self, goal: RosMessage) -> GoalPose:
-        """Pose of a ``geometry_msgs/msg/PoseStamped``.
+        """Read the pose of a ``geometry_msgs/msg/PoseStamped``.
 
         Raises:
-            InputError: it is in another frame than map or odom.
+            InputError: its frame is neither map nor odom.
         """
         frames = {self._names.frame(frame): frame for frame in ("map", "odom")}
         frame = frame_in(goal["header"], (*frames,)) or next(iter(frames))
@@ -435,20 +435,20 @@ class RosFace:
 
 
 OPTICAL: Final = "camera_optical"
-"""The camera's frame by the convention of pictures: z forward, x right, y down."""
+"""Frame of the camera by the optical convention: z forward, x right, y down."""
 
 
 def _further_frames(fixed: Iterable[Any]) -> list[Any]:
-    """Fixed transforms that ROS 2 expects besides."""
+    """Return the additional fixed transforms that ROS 2 expects."""
     frames = [mount(convert.FOOTPRINT, (0.0, 0.0, 0.0))]
     if any(row.child == "camera" for row in fixed):
-        half = math.pi / 2  # x forward, y left, z up to z forward, x right, y down
+        half = math.pi / 2  # rotation from x forward, y left, z up to z forward, x right, y down
         frames.append(mount(OPTICAL, (0.0, 0.0, 0.0), (-half, 0.0, -half), parent="camera"))
     return frames
 
 
 async def _outcome(order: Awaitable[Any]) -> Mapping[str, Any]:
-    """Answer of ``std_srvs/srv/Trigger``."""
+    """Return the answer of ``std_srvs/srv/Trigger``."""
     try:
         state = await order
     except TruckError as error:

@@ -1,4 +1,4 @@
-"""The robot's configuration as ROS 2 needs it: description, outline, lens and joints."""
+"""Parts of the robot's configuration for ROS 2: description, outline, lens and joints."""
 
 import math
 import xml.etree.ElementTree as ET
@@ -24,33 +24,33 @@ class RobotFacts:
     """Data of the robot's configuration that the ROS 2 node needs."""
 
     length: float
-    """m."""
+    """Length of the footprint (m)."""
     width: float
-    """m."""
+    """Width of the footprint (m)."""
     lens: LensConfig | None = None
     description: str | None = None
-    """URDF with the robot's own names of frames; None: its body has none."""
+    """URDF with the robot's own frame names; None if its body has none."""
     joints: "WheelJoints | None" = None
     localised: bool = True
-    """Whether the robot finds its place by itself; False where it takes map to odom from ROS 2."""
+    """Whether the robot localises itself; False if ROS 2 provides map to odom."""
     mapped: bool = True
-    """Whether the map is the robot's own; False where it takes ``map`` from ROS 2."""
+    """Whether the robot builds its own map; False if ROS 2 provides ``map``."""
     plans: bool = True
-    """Whether the robot's own planner serves goals; False where Nav2 does and drives by ``cmd_vel``."""
+    """Whether the robot's own planner serves goals; False if Nav2 plans and drives by ``cmd_vel``."""
 
 
 @dataclass(frozen=True, slots=True)
 class WheelJoints:
-    """Angles of the wheels of a body with two axles and one driven shaft."""
+    """Joint angles of the wheels of a body with two axles and one driven shaft."""
 
     chassis: Chassis
     track: float
     """Distance between left and right wheels (m)."""
     ratio: float
-    """Turns of the motor for one of the wheels."""
+    """Motor turns per wheel turn."""
 
     def angles(self, steering: SteeringFeedback | None, drive: DriveFeedback) -> Mapping[str, float]:
-        """Steering angle and rotation, rad, by joint of the description; all wheels are shown at the same angle."""
+        """Return steering angle and rotation (rad) by joint of the description; all wheels have the same angle."""
         found = {f"{wheel}_spin": drive.position / self.ratio for wheel in WHEELS}
         if steering is None or not self.chassis.steered:
             return found
@@ -63,7 +63,7 @@ class WheelJoints:
 
 
 def renamed_links(urdf: str, name: Callable[[str], str]) -> str:
-    """The description with the frames of its links as ROS 2 has them; joints keep their names."""
+    """Return the description with the links renamed to their ROS frames; joints keep their names."""
     robot = ET.fromstring(urdf)  # noqa: S314 - our own text
     for element in (*robot.iter("link"), *robot.iter("parent"), *robot.iter("child")):
         attribute = "name" if element.tag == "link" else "link"

@@ -1,9 +1,9 @@
-"""ROS 2 interfaces by name: their fields, and the type hashes that ROS 2 programs compare.
+"""ROS 2 interfaces by name: fields and type hashes.
 
-``interfaces.txt`` lists them in the language of ``.msg``, ``.srv`` and ``.action`` files, without constants and
-defaults: neither is part of a hash. The hash of a type is RIHS01: SHA-256 of its type description as JSON (REP 2016).
-Iron, Jazzy, Kilted and Lyrical have the same hash for every interface here except for some actions of Nav2. Their
-other editions are marked, such as ``@kilted``: same name on the wire, fields of that distribution.
+``interfaces.txt`` lists them in the syntax of ``.msg``, ``.srv`` and ``.action`` files, without constants and defaults,
+which are not part of a hash. The hash of a type is RIHS01: SHA-256 of its type description as JSON (REP 2016). Iron,
+Jazzy, Kilted and Lyrical have the same hash for every interface here except for some actions of Nav2. Other editions of
+those are marked, such as ``@kilted``: the same name on the wire, with the fields of that distribution.
 """
 
 import hashlib
@@ -44,7 +44,7 @@ ARRAY, BOUNDED, UNBOUNDED = 48, 96, 144
 _FIELD: Final = re.compile(r"(?P<kind>[\w/@]+)(?P<many>\[(?P<limit><=)?(?P<count>\d*)\])? (?P<name>\w+)")
 
 _PLACEHOLDER: Final = "uint8 structure_needs_at_least_one_member"
-"""Field of interfaces without any."""
+"""Field of an interface without fields."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class RosField:
 
     name: str
     kind: str
-    """Primitive, or full name of an interface such as ``std_msgs/msg/Header``."""
+    """Primitive type, or full name of an interface such as ``std_msgs/msg/Header``."""
     many: int = 0
     """0 for one value, or ``ARRAY``, ``BOUNDED`` or ``UNBOUNDED``."""
     count: int = 0
@@ -89,7 +89,7 @@ def _fields(text: str) -> tuple[RosField, ...]:
 
 
 def _service(name: str, request: str, response: str) -> Iterator[tuple[str, str]]:
-    """A service's own types, as ROS 2 derives them."""
+    """Yield the types that ROS 2 derives from a service."""
     yield f"{name}_Request", request
     yield f"{name}_Response", response
     event = f"service_msgs/msg/ServiceEventInfo info\n{name}_Request[<=1] request\n{name}_Response[<=1] response"
@@ -99,7 +99,7 @@ def _service(name: str, request: str, response: str) -> Iterator[tuple[str, str]
 
 
 def _action(name: str, goal: str, result: str, feedback: str) -> Iterator[tuple[str, str]]:
-    """An action's own types, as ROS 2 derives them."""
+    """Yield the types that ROS 2 derives from an action."""
     number = "unique_identifier_msgs/msg/UUID goal_id"
     yield from ((f"{name}_Goal", goal), (f"{name}_Result", result), (f"{name}_Feedback", feedback))
     accepted = "bool accepted\nbuiltin_interfaces/msg/Time stamp"
@@ -109,7 +109,7 @@ def _action(name: str, goal: str, result: str, feedback: str) -> Iterator[tuple[
 
 
 def parsed(text: str) -> dict[str, tuple[RosField, ...]]:
-    """Fields by the name of the interface; services and actions with the types that ROS 2 derives from them."""
+    """Parse fields by interface name; services and actions include the types that ROS 2 derives from them."""
     found: dict[str, tuple[RosField, ...]] = {}
     for part in text.split("=== ")[1:]:
         name, _, body = part.partition("\n")
@@ -125,7 +125,7 @@ def parsed(text: str) -> dict[str, tuple[RosField, ...]]:
 
 @cache
 def interfaces() -> dict[str, tuple[RosField, ...]]:
-    """Fields of every interface of the file, by its full name such as ``nav_msgs/msg/Odometry``."""
+    """Return the fields of every interface of the file by its full name, such as ``nav_msgs/msg/Odometry``."""
     return parsed(FILE.read_text(encoding="utf-8"))
 
 
@@ -146,13 +146,13 @@ DISTRIBUTIONS: Final = ("humble", "jazzy", "kilted", "lyrical")
 def action_edition(action: str, distribution: str) -> str:
     """Return the edition of an action in a distribution, e.g. ``nav2_msgs/action/FollowPath@lyrical``."""
     newest = DISTRIBUTIONS.index(distribution)
-    marks = DISTRIBUTIONS[min(newest, 1) : newest + 1]  # 1: no later one has Humble's editions
+    marks = DISTRIBUTIONS[min(newest, 1) : newest + 1]  # 1: no later distribution has Humble's editions
     found = (f"{action}@{mark}" for mark in reversed(marks))
     return next((edition for edition in found if f"{edition}_Goal" in interfaces()), action)
 
 
 def wire_name(name: str) -> str:
-    """Name of an interface without the mark of a distribution."""
+    """Return an interface name without the mark of a distribution."""
     return re.sub("@[a-z]+", "", name)
 
 
@@ -161,11 +161,11 @@ _OF_ACTIONS: Final = {
     "_GetResult": "GetResultService",
     "_FeedbackMessage": "FeedbackMessage",
 }
-"""Attributes of an action's ``Impl`` by the ends of names: packages of Python do not export what ROS 2 derives."""
+"""Attributes of an action's ``Impl`` by name suffix: Python packages do not export the types that ROS 2 derives."""
 
 
 def installed_interface(name: str) -> Any:
-    """Class that ROS 2 generated for an interface, or None if its package, or the interface in it, is not installed."""
+    """Return the class that ROS 2 generated for an interface, or None if its package or the interface is missing."""
     package, group, own = wire_name(name).split("/")
     try:
         module = importlib.import_module(f"{package}.{group}")
@@ -179,7 +179,7 @@ def installed_interface(name: str) -> Any:
 
 
 def hash_of(name: str, known: dict[str, tuple[RosField, ...]]) -> str:
-    """Type hash of an interface, ``RIHS01_`` and 64 hexadecimal digits."""
+    """Return the type hash of an interface, ``RIHS01_`` and 64 hexadecimal digits."""
 
     def described(own: str) -> dict[str, Any]:
         return {"type_name": wire_name(own), "fields": [field.described() for field in known[own]]}
@@ -193,5 +193,5 @@ def hash_of(name: str, known: dict[str, tuple[RosField, ...]]) -> str:
 
 @cache
 def type_hash(name: str) -> str:
-    """Type hash of an interface of the file."""
+    """Return the type hash of an interface of the file."""
     return hash_of(name, interfaces())

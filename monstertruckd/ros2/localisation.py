@@ -24,45 +24,45 @@ from monstertruckd.ros2.operators import Operators, frame_in, stamp_of
 from monstertruckd.ros2.rmw import LATCHED
 
 CORRECTION_PERIOD: Final = SECOND // 10
-"""Minimum time between two corrections sent to the robot (ns)."""
+"""Minimum interval between two corrections sent to the robot (ns)."""
 CORRECTION_LEASE: Final = SECOND
 """Maximum age of a correction (ns)."""
 
 
 def pose_in(pose: RosMessage) -> Array:
-    """Planar part of a ``geometry_msgs/msg/Pose``, shape (3,): m, m, rad."""
+    """Return the planar part of a ``geometry_msgs/msg/Pose``, shape (3,): m, m, rad."""
     place, turn = pose["position"], pose["orientation"]
     return np.array((place["x"], place["y"], yaw_of((turn["x"], turn["y"], turn["z"], turn["w"]))))
 
 
 class RosLocalisation:
-    """Send the robot the pose of its odom frame in map, as amcl, slam_toolbox or robot_localization estimate it.
+    """Sends the robot the pose of its odom frame in map, as estimated by amcl, slam_toolbox or robot_localization.
 
-    - ``/tf``: the transform from map to odom. amcl dates it ahead, so only the time of sending is checked.
-    - ``odometry/filtered``: pose of the base by an estimator of ROS 2. In frame map it localises the robot alone; in
-      frame odom it is composed with that transform. Without a publisher of the transform, odom is map.
+    - ``/tf``: the transform from map to odom. amcl stamps it in the future, so only the send time is checked.
+    - ``odometry/filtered``: pose of the base from a ROS 2 estimator. In frame map it localises the robot by itself; in
+      frame odom it is composed with the transform. Without a publisher of the transform, odom is map.
 
     Args:
         node: node of ROS 2.
         operators: sessions of the nodes.
-        names: stamps and frames, as they are now.
+        names: returns the current conversion of stamps and frames.
         clock: time.
     """
 
     def __init__(self, node: RosNode, operators: Operators, names: Callable[[], RosNames], clock: Clock) -> None:
         self._operators, self._names, self._clock = operators, names, clock
         self._odometry: deque[tuple[int, Array]] = deque(maxlen=128)
-        """Stamps, ns, and poses of the robot's odometry: of the last 2.5 s at 50 Hz."""
+        """Stamps (ns) and poses of the robot's odometry during the last 2.5 s at 50 Hz."""
         self._odom: tuple[int, Array] | None = None
-        """When ``/tf`` brought the pose of odom in map last, ns, and the pose."""
+        """Arrival time (ns) of the latest pose of odom in map on ``/tf``, and the pose."""
         self._estimated_at: int | None = None
-        """When ``odometry/filtered`` brought a pose in odom last (ns)."""
+        """Arrival time of the latest pose in odom on ``odometry/filtered`` (ns)."""
         self._sent_at: int | None = None
         node.subscribe("/tf", "tf2_msgs/msg/TFMessage", self._tf)
         node.subscribe("odometry/filtered", "nav_msgs/msg/Odometry", self._estimate)
 
     def observe(self, odometry: Odometry) -> None:
-        """Take the robot's own odometry."""
+        """Process the robot's own odometry."""
         self._odometry.append((odometry.stamp, np.array((odometry.pose.x, odometry.pose.y, odometry.pose.yaw))))
 
     def _tf(self, arrival: RosArrival) -> None:
@@ -101,15 +101,15 @@ class RosLocalisation:
             if self._odom is not None:
                 since, odom = self._odom
                 if now - since > CORRECTION_LEASE:
-                    return  # lost, as without the estimator
+                    return  # lost, like without the estimator
                 correction = compose(odom, correction)
         self._send(sender, "odometry/filtered", correction, now)
 
     def _correction(self, message: RosMessage, names: RosNames) -> Array:
-        """Pose of the robot's odom in the frame of an estimate.
+        """Return the pose of the robot's odom frame in the frame of an estimate.
 
         Raises:
-            InputError: its frames are others, or its stamp is older than the odometry kept.
+            InputError: the frames are wrong, or the stamp is older than the stored odometry.
         """
         frame_in(message["header"], (names.frame("map"), names.frame("odom")))
         frame_in({"frame_id": message["child_frame_id"]}, (names.frame("base"), names.frame(FOOTPRINT)))
@@ -126,14 +126,14 @@ class RosLocalisation:
 
 
 class RosMaps:
-    """Send the robot the map of ROS 2, of slam_toolbox or map_server, latched as they have it.
+    """Sends the robot the latched map of slam_toolbox or map_server.
 
     A map may be of any age, but not from an unknown publisher.
 
     Args:
         node: node of ROS 2.
         operators: sessions of the nodes.
-        names: stamps and frames, as they are now.
+        names: returns the current conversion of stamps and frames.
     """
 
     def __init__(self, node: RosNode, operators: Operators, names: Callable[[], RosNames]) -> None:

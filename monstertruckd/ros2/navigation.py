@@ -1,4 +1,4 @@
-"""Actions of Nav2, driven by the robot's own planner and tracker, and the lifecycle answers of its panel in RViz."""
+"""Nav2 actions, executed by the robot's own planner and tracker, and lifecycle services for Nav2's RViz panel."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -25,7 +25,7 @@ from monstertruckd.ros2.node import RosNode, RosSender
 from monstertruckd.ros2.operators import Operators
 
 GoalPose = tuple[tuple[float, float, float], str]
-"""x, y (m), yaw (rad), and the robot's name of the frame."""
+"""x, y (m), yaw (rad), and the robot's frame name."""
 
 PoseReader = Callable[[RosMessage], GoalPose]
 """Reads a ``geometry_msgs/msg/PoseStamped``; raises ``InputError`` for another frame."""
@@ -51,19 +51,19 @@ class WaypointStatus(IntEnum):
 
 @dataclass(slots=True)
 class PosesToReach:
-    """Poses that a goal asks for, the last one to be stopped at."""
+    """Poses of a goal; the robot stops at the last one."""
 
     poses: list[tuple[float, float, float]]
-    """x, y (m), yaw (rad)."""
+    """Poses: x, y (m), yaw (rad)."""
     frame: str
-    """The robot's name of the frame."""
+    """The robot's frame name."""
     asked: list[RosMessage] = field(default_factory=list)
-    """The same as ``geometry_msgs/msg/PoseStamped``."""
+    """The same poses as ``geometry_msgs/msg/PoseStamped``."""
     passed: int = 0
-    """Number of poses that have been passed so far."""
+    """Number of poses passed so far."""
 
     def statuses(self, passed: int, rest: WaypointStatus) -> list[RosValues]:
-        """``nav2_msgs/msg/WaypointStatus`` of every pose."""
+        """Return the ``nav2_msgs/msg/WaypointStatus`` of every pose."""
         return [
             {
                 "waypoint_status": int(WaypointStatus.COMPLETED if number < passed else rest),
@@ -76,12 +76,12 @@ class PosesToReach:
 
 
 class GoalAction(RobotAction[PosesToReach]):
-    """Drives to one pose, or through several, by the robot's planner.
+    """Drives to one pose, or through several, with the robot's planner.
 
     Args:
         client: follows the robot's pose.
         pose_in: reads poses.
-        names: stamps and frames, as they are now.
+        names: returns the current conversion of stamps and frames.
         clock: time.
     """
 
@@ -123,13 +123,13 @@ class GoalAction(RobotAction[PosesToReach]):
         }
         if pose is not None:
             values["current_pose"] = {"header": names.header(pose), "pose": convert.pose_of(pose.pose)}
-            if (speed := abs(pose.twist.vx)) > 0.02:  # m/s; below it the time of arrival is not known
+            if (speed := abs(pose.twist.vx)) > 0.02:  # m/s; below it the time of arrival is unknown
                 values["estimated_time_remaining"] = _duration(state.remaining / speed)
         return values
 
 
 class NavigateToPose(GoalAction):
-    """``navigate_to_pose``."""
+    """Action ``navigate_to_pose``."""
 
     name = "navigate_to_pose"
     interface = "nav2_msgs/action/NavigateToPose"
@@ -142,13 +142,13 @@ class NavigateToPose(GoalAction):
 
 
 class NavigateThroughPoses(GoalAction):
-    """``navigate_through_poses``: all but the last are passed without a stop."""
+    """Action ``navigate_through_poses``: the robot passes all poses but the last without a stop."""
 
     name = "navigate_through_poses"
     interface = "nav2_msgs/action/NavigateThroughPoses"
 
     def read(self, goal: RosMessage) -> PosesToReach:
-        """See ``RobotAction``; since Kilted poses without a frame use the frame of the message."""
+        """See ``RobotAction``; since Kilted, poses without a frame use the frame of the message."""
         _require_own_planner(goal)
         asked, header = goal["poses"], {"frame_id": ""}
         if isinstance(asked, dict):  # nav_msgs/msg/Goals
@@ -169,10 +169,10 @@ class NavigateThroughPoses(GoalAction):
 
 
 def path_in(message: RosMessage, pose_in: PoseReader, stamp: int) -> Path:
-    """Path of a ``nav_msgs/msg/Path``.
+    """Convert a ``nav_msgs/msg/Path``.
 
-    The robot arrives backward at a pose that faces away from its step. Planners that give positions only leave all
-    orientations but the last at the identity: such a path is driven forward.
+    A step whose pose faces against it is driven backward. Planners that compute only positions leave all orientations
+    but the last at the identity; such a path is driven forward.
 
     Args:
         message: the message.
@@ -180,7 +180,7 @@ def path_in(message: RosMessage, pose_in: PoseReader, stamp: int) -> Path:
         stamp: stamp of the path (ns).
 
     Raises:
-        InputError: it is too short or too long, or in another frame than map or odom.
+        InputError: the path is too short or too long, or its frame is neither map nor odom.
     """
     rows = message["poses"]
     if not 2 <= len(rows) <= MAX_POSES:
@@ -198,12 +198,12 @@ def path_in(message: RosMessage, pose_in: PoseReader, stamp: int) -> Path:
 
 
 class FollowPath(RobotAction[Path]):
-    """``follow_path``: the robot's tracker follows a path that was planned in ROS 2.
+    """Action ``follow_path``: the robot's tracker follows a path planned in ROS 2.
 
     Args:
         client: follows the tracker and the robot's pose.
         pose_in: reads poses.
-        names: stamps and frames, as they are now.
+        names: returns the current conversion of stamps and frames.
         clock: time.
     """
 
@@ -223,7 +223,7 @@ class FollowPath(RobotAction[Path]):
     async def drive(self, driver: TruckClient, work: Path, show: Callable[[RosValues], None]) -> tuple[Reason, str]:
         """Send the path and wait for its end."""
         report = _FeedbackReport(self._feedback, show)
-        # 10.0: seconds without progress after which Nav2's controller server gives up by default
+        # 10.0: default time without progress after which Nav2's controller server aborts (s)
         arrival = await follow(driver, self._clock, work, arm=False, report=report, disarmed_for=10.0)
         return arrival.reason, arrival.text
 
@@ -268,22 +268,22 @@ class LifecycleCommand(IntEnum):
 
     @property
     def activates(self) -> bool:
-        """Whether navigation is active afterwards."""
+        """Whether navigation is active after the command."""
         return self in (LifecycleCommand.STARTUP, LifecycleCommand.RESUME, LifecycleCommand.CONFIGURE)
 
 
 class Navigation:
-    """All actions, and the two lifecycle managers that Nav2's panel asks.
+    """All actions, and the two lifecycle managers for Nav2's panel.
 
-    To pause navigation is to cancel the goals of the actions and to accept none until it is resumed; operators of other
-    kinds are not affected. Localisation cannot be paused.
+    Pausing navigation cancels the goals of the actions and refuses new ones until it is resumed; operators outside ROS
+    2 are not affected. Localisation cannot be paused.
 
     Args:
         node: node of ROS 2.
         operators: sessions of the nodes that send goals.
         client: follows the robot's state.
         pose_in: reads poses.
-        names: stamps and frames, as they are now.
+        names: returns the current conversion of stamps and frames.
         clock: time.
     """
 
@@ -315,7 +315,7 @@ class Navigation:
             node.serve(f"{name}/manage_nodes", "nav2_msgs/srv/ManageLifecycleNodes", manage)
 
     def close(self) -> None:
-        """Give up all goals."""
+        """Cancel all goals."""
         for server in self._servers:
             server.close()
 

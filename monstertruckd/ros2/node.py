@@ -1,4 +1,4 @@
-"""Interface of a face to ROS 2: publishers, subscriptions and services of one node, by whatever middleware."""
+"""ROS 2 interface of the bridge: publishers, subscriptions and services of one node, for any middleware."""
 
 from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from monstertruckd.ros2.cdr import RosMessage
 from monstertruckd.ros2.rmw import RELIABLE, RosQos
 
 Publish = Callable[[Mapping[str, Any]], None]
-"""Publishes one message; to be called on the event loop."""
+"""Publishes one message; call it on the event loop."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,45 +23,45 @@ class RosSender:
 
 @dataclass(frozen=True, slots=True)
 class RosArrival:
-    """A message of another node."""
+    """Message of another node."""
 
     message: RosMessage
     sender: RosSender | None
-    """None: the graph knows no publisher of this topic that could have sent it."""
+    """Sender; None if the graph has no publisher of this topic that could have sent it."""
     publisher: bytes
     """Identity of the publisher."""
     sequence: int
-    """Grows with every message of the publisher."""
+    """Sequence number, which increases with every message of the publisher."""
     stamp: int
-    """When it was sent, by the sender's clock, ns since 1970."""
+    """Send time by the sender's clock (ns since 1970)."""
 
 
 Take = Callable[[RosArrival], None]
 Answer = Callable[[RosMessage, RosSender | None], Awaitable[Mapping[str, Any]]]
-"""Answers a request of a service."""
+"""Answers a service request."""
 
 
 class RosNode(Protocol):
     """One node of the ROS 2 graph. All callbacks are called on the event loop."""
 
     distributions: Sequence[str]
-    """Members of ``interfaces.DISTRIBUTIONS`` whose nodes it meets."""
+    """Members of ``interfaces.DISTRIBUTIONS`` whose nodes it can talk to."""
 
     def publisher(self, topic: str, interface: str, qos: RosQos) -> Publish:
-        """Offer a topic; ``topic`` is absolute, or relative to the node's namespace."""
+        """Advertise a topic; ``topic`` is absolute, or relative to the node's namespace."""
 
     def subscribe(self, topic: str, interface: str, take: Take, qos: RosQos = RELIABLE) -> None:
         """Receive a topic: the latest message of every publisher, also an earlier one if ``qos`` is latched."""
 
     def serve(self, service: str, interface: str, answer: Answer) -> None:
-        """Offer a service; requests are answered in parallel."""
+        """Advertise a service; requests are answered in parallel."""
 
     def qualified(self, name: str) -> str:
-        """Full name of a topic or service that is absolute, relative to the namespace, or to the node by ``~/``."""
+        """Return the full name of a topic or service: absolute, relative to the namespace, or to the node by ``~/``."""
 
     @property
     def malformed(self) -> int:
-        """Messages and requests so far that were not as the wire has them."""
+        """Number of malformed messages and requests so far."""
 
     def present(self, sender: RosSender) -> bool:
         """Whether the graph still has this node."""
@@ -74,11 +74,11 @@ def sole_publisher(
 
     Args:
         found: namespace, name of the node and identity of all publishers.
-        namespace: of this program's nodes.
-        own: their names.
+        namespace: namespace of this program's nodes.
+        own: names of this program's nodes.
     """
     others = [row for row in found if row[0] != namespace or row[1] not in own]
-    undiscovered = "_NODE_NAME_UNKNOWN_"  # of rmw: the publisher is known before its node is
+    undiscovered = "_NODE_NAME_UNKNOWN_"  # name in rmw while the publisher is known, but not its node
     if len(others) != 1 or others[0][1] == undiscovered:
         return None, b""
     ((space, name, identity),) = others

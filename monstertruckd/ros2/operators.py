@@ -1,8 +1,8 @@
 """ROS 2 nodes as operators of the robot, each under its own name.
 
 ROS 2 has neither leases nor priorities nor nonces: a plain forwarder would bypass the protections of the gate.
-So every node is a separate source, with its own session; a message that could be old, a repetition or from an unknown
-publisher is refused here, and all that passes is judged by the gate as any operator's request is.
+So every node is a separate source with its own session. This module refuses messages that may be old, repeated or from
+an unknown publisher; the gate judges the others like the requests of any operator.
 """
 
 import asyncio
@@ -19,32 +19,32 @@ from monstertruckd.ros2.cdr import RosMessage
 from monstertruckd.ros2.node import RosArrival, RosSender
 
 LEASE: Final = 0.25
-"""Validity of a drive message (s); the face never repeats it."""
+"""Validity of a drive message (s); the bridge never repeats it."""
 
 RosOrder = Callable[[TruckClient], Awaitable[Any]]
-"""Asks the robot for something."""
+"""Sends a request to the robot."""
 
 
 def source_of(node: str, owner: str | None = None) -> str:
-    """Name of a node as a source of requests, such as ``ros2:teleop``, behind the owner of a certificate.
+    """Return the source name of a node, such as ``ros2:teleop``, after the owner of the certificate if there is one.
 
     Args:
         node: qualified name.
-        owner: common name of the certificate; the robot binds sources to it.
+        owner: common name of the certificate; the robot binds source names to it.
     """
     name = re.sub(r"[^A-Za-z0-9_.-]", ".", node.strip("/")) or "node"
     before = "ros2" if owner is None else f"{owner}:ros2"
-    return f"{before}:{name}"[:64]  # 64: characters of a source
+    return f"{before}:{name}"[:64]  # 64: maximum length of a source name
 
 
 def stamp_of(time: RosMessage) -> int:
-    """Nanoseconds of a ``builtin_interfaces/msg/Time``."""
+    """Return a ``builtin_interfaces/msg/Time`` in nanoseconds."""
     return int(time["sec"]) * SECOND + int(time["nanosec"])
 
 
 def _require_recent(what: str, stamp: int, now: int) -> None:
     difference = (now - stamp) / SECOND
-    max_age = 0.5  # maximum difference of a stamp from this clock, s: the gate's limit for the age of a request
+    max_age = 0.5  # maximum difference between a stamp and this clock (s): the gate's limit for the age of a request
     if abs(difference) > max_age:
         side = "behind" if difference > 0.0 else "ahead of"
         raise InputError(
@@ -57,12 +57,12 @@ def check_arrival(arrival: RosArrival, now: int, newest: dict[bytes, int]) -> No
     """Accept a message that is neither old nor a repetition.
 
     Args:
-        arrival: arrival of a known publisher.
+        arrival: message of a known publisher.
         now: real time (ns).
         newest: latest sequence numbers by publisher; updated with the message.
 
     Raises:
-        InputError: why it is refused.
+        InputError: the message is old or repeated.
     """
     _require_recent("its time of sending", arrival.stamp, now)
     before = newest.get(arrival.publisher)
@@ -72,7 +72,7 @@ def check_arrival(arrival: RosArrival, now: int, newest: dict[bytes, int]) -> No
 
 
 def check_age(what: str, header: RosMessage, now: int) -> None:
-    """Accept the stamp of a header; 0 means no stamp.
+    """Check the stamp of a header; 0 means no stamp.
 
     Args:
         what: name of the message in the refusal.
@@ -80,17 +80,17 @@ def check_age(what: str, header: RosMessage, now: int) -> None:
         now: real time (ns).
 
     Raises:
-        InputError: it is old, or in the future.
+        InputError: the stamp is old or in the future.
     """
     if stamp := stamp_of(header["stamp"]):
         _require_recent(what, stamp, now)
 
 
 def frame_in(header: RosMessage, frames: tuple[str, ...]) -> str:
-    """The frame of a header, empty if it names none.
+    """Return the frame of a header; empty if it has none.
 
     Raises:
-        InputError: it is none of ``frames``.
+        InputError: the frame is not one of ``frames``.
     """
     frame = str(header["frame_id"]).lstrip("/")
     if frame not in ("", *frames):
@@ -99,18 +99,18 @@ def frame_in(header: RosMessage, frames: tuple[str, ...]) -> str:
 
 
 def check_header(header: RosMessage, now: int, frames: tuple[str, ...]) -> None:
-    """Accept the header of a message that drives. Raises as ``check_age`` and ``frame_in`` do."""
+    """Check the header of a message that drives; raises the errors of ``check_age`` and ``frame_in``."""
     check_age("its header's stamp", header, now)
     frame_in(header, frames)
 
 
 def planar_twist(twist: RosMessage) -> tuple[float, float, float]:
-    """Velocities forward and to the left, m/s, and turn rate (rad/s).
+    """Return the velocities forward and to the left (m/s) and the turn rate (rad/s).
 
-    Numbers that are not finite reach the gate, which refuses them by name.
+    Non-finite numbers are forwarded to the gate, which refuses them with its own reason.
 
     Raises:
-        InputError: it has another component.
+        InputError: another component is not 0.
     """
     linear, angular = twist["linear"], twist["angular"]
     others = {"linear.z": linear["z"], "angular.x": angular["x"], "angular.y": angular["y"]}
@@ -126,18 +126,18 @@ class RosOperator:
     client: TruckClient
     exit: AsyncExitStack
     waiting: RosOrder | None = None
-    """Latest request to drive that is not sent yet."""
+    """Latest drive request that has not been sent yet."""
     task: asyncio.Task[None] | None = None
 
 
 class Operators:
-    """Sessions of the nodes that ask for something.
+    """Sessions of the nodes that send requests.
 
     Args:
-        connect: makes the client of a source.
-        owner: owner of this side's certificate; None: without.
+        connect: creates the client of a source.
+        owner: owner of this program's certificate; None without one.
         clock: time.
-        report: gets every refusal: node and text.
+        report: called with the node and the text of every refusal.
     """
 
     def __init__(
@@ -157,12 +157,12 @@ class Operators:
         """Latest sequence number of every publisher."""
         self._asking: set[asyncio.Task[None]] = set()
         self.refused = 0
-        """Messages and requests that were refused here."""
+        """Number of messages and requests refused here."""
         self.last_refusal = ""
 
     @property
     def sources(self) -> list[str]:
-        """Sources that are connected."""
+        """Sources of the connected nodes."""
         return [operator.client.source for operator in self._operators.values()]
 
     def refuse(self, node: str, what: str, why: str) -> None:
@@ -177,7 +177,7 @@ class Operators:
         Args:
             what: name of the topic.
             arrival: the message.
-            check: raises ``InputError`` for its content; gets the real time (ns).
+            check: checks the content at a real time (ns); raises ``InputError``.
         """
         sender = arrival.sender
         if sender is None:
@@ -193,9 +193,9 @@ class Operators:
         return sender
 
     def drive(self, sender: RosSender, what: str, order: RosOrder) -> None:
-        """Have a node's request to drive sent; if several wait, only the latest is sent.
+        """Send a node's drive request; if several are waiting, only the latest is sent.
 
-        Requests that come while the node's session is opened are not sent: they would be old by then.
+        Requests that arrive while the node's session is being opened are dropped, because they would be too old.
         """
         operator = self._operators.get(sender)
         if operator is None:
@@ -215,7 +215,7 @@ class Operators:
                 self.refuse(sender.node, what, str(error))
 
     def ask(self, sender: RosSender, what: str, order: RosOrder) -> None:
-        """Have a node's request carried out; a refusal is reported."""
+        """Send a node's request and report a refusal."""
 
         async def carry_out() -> None:
             await order(await self.session(sender))
@@ -223,7 +223,7 @@ class Operators:
         self.run(sender.node, what, carry_out())
 
     def run(self, node: str, what: str, work: Coroutine[Any, Any, Any]) -> None:
-        """Have ``work`` done; a refusal is reported under the node's name."""
+        """Run ``work`` and report a refusal under the node's name."""
 
         async def reported() -> None:
             try:
@@ -236,7 +236,7 @@ class Operators:
         task.add_done_callback(self._asking.discard)
 
     async def session(self, sender: RosSender) -> TruckClient:
-        """A node's session, opened when it is needed first.
+        """Return the session of a node; it is opened on first use.
 
         Raises:
             BusyError: too many nodes are connected.
@@ -245,7 +245,7 @@ class Operators:
         if sender in self._operators:
             return self._operators[sender].client
         if sender not in self._opening:
-            most_operators = 16  # nodes that are connected to the robot at once
+            most_operators = 16  # maximum number of nodes connected to the robot
             if len(self._operators) + len(self._opening) >= most_operators:
                 raise BusyError(f"{most_operators} ROS nodes are connected: expected fewer")
             self._opening[sender] = asyncio.create_task(self._open(sender))
@@ -265,7 +265,7 @@ class Operators:
         return operator
 
     async def leave_absent(self, present: Callable[[RosSender], bool]) -> None:
-        """End the sessions of nodes that have left."""
+        """Close the sessions of nodes that have left."""
         self._sequences = {sender: newest for sender, newest in self._sequences.items() if present(sender)}
         for sender, operator in list(self._operators.items()):
             if not present(sender):
@@ -273,11 +273,11 @@ class Operators:
                 await operator.exit.aclose()
 
     async def close(self) -> None:
-        """End all sessions."""
+        """Close all sessions."""
         for task in (*self._asking, *self._opening.values()):
             task.cancel()
         await self.leave_absent(lambda _: False)
 
 
 async def _connected(_: TruckClient) -> None:
-    """Ask for nothing more than the session."""
+    """Request nothing; only the session is needed."""

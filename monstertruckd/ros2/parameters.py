@@ -1,4 +1,4 @@
-"""Live settings of the robot as parameters of the node: the six services that ``ros2 param`` and rqt ask."""
+"""Live settings of the robot as node parameters: the six services used by ``ros2 param`` and rqt."""
 
 from collections.abc import Mapping
 from typing import Any, Final
@@ -16,7 +16,7 @@ TYPES: Final = {bool: 1, int: 2, float: 3, str: 4}
 
 
 BOUNDS: Final = (("above", "at_least"), ("below", "at_most"))
-"""Keys of the least and of the greatest value in a row."""
+"""Keys of the minimum and maximum in a row."""
 
 
 def value_of(value: Any) -> dict[str, Any]:
@@ -26,10 +26,10 @@ def value_of(value: Any) -> dict[str, Any]:
 
 
 def plain_value(value: RosMessage) -> Any:
-    """The value of a ``rcl_interfaces/msg/ParameterValue``.
+    """Return the value of a ``rcl_interfaces/msg/ParameterValue``.
 
     Raises:
-        InputError: it is not a plain value.
+        InputError: its type is not a plain value.
     """
     name = FIELDS.get(value["type"])
     if name is None:
@@ -49,12 +49,12 @@ def descriptor(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class RosParameters:
-    """Serves them.
+    """Serves the parameter services.
 
     Args:
         node: node of ROS 2.
-        operators: sessions of the nodes that set one.
-        client: reads them.
+        operators: sessions of the nodes that set parameters.
+        client: client that reads the settings.
     """
 
     def __init__(self, node: RosNode, operators: Operators, client: TruckClient) -> None:
@@ -71,7 +71,7 @@ class RosParameters:
         self._name = node.qualified("~/set_parameters").rpartition("/")[0]
 
     async def _rows(self) -> dict[str, dict[str, Any]]:
-        """Settings by name; none if the robot does not answer."""
+        """Return the settings by name; empty if the robot does not answer."""
         try:
             return {row["key"]: row for row in (await self._client.call("settings"))["settings"]}
         except TruckError as error:
@@ -82,7 +82,7 @@ class RosParameters:
         prefixes, depth = request["prefixes"], request["depth"]
 
         def within(name: str) -> bool:
-            """Whether a name has a prefix, and not too many parts behind it."""
+            """Return whether a name has one of the prefixes and at most the requested depth below it."""
             if not prefixes:
                 return not depth or name.count(".") < depth
             below = [name.removeprefix(f"{prefix}.") for prefix in prefixes if name.startswith(f"{prefix}.")]

@@ -1,11 +1,11 @@
-"""A ROS 2 node by ``rclpy``: for every middleware that ROS 2 has, in an environment where ROS 2 is installed.
+"""ROS 2 node based on ``rclpy``, for every ROS 2 middleware; requires a ROS 2 installation.
 
-Messages pass as the bytes that the face encodes and decodes itself. Interfaces whose package is not installed are left
-out. ``rclpy`` reports neither the publisher of a message nor the client of a request:
+Messages are passed as bytes, which the bridge encodes and decodes itself. Interfaces whose package is not installed are
+omitted. ``rclpy`` reports neither the publisher of a message nor the client of a request:
 
 - A message is attributed to the publisher of its topic if there is exactly one besides this node, and to an unknown
   publisher otherwise.
-- All clients of services are one sender.
+- All service clients count as one sender.
 """
 
 import asyncio
@@ -31,16 +31,17 @@ from monstertruckd.ros2.node import Answer, Publish, RosArrival, RosSender, Take
 from monstertruckd.ros2.rmw import RELIABLE, RosQos
 
 CLIENTS: Final = RosSender("/service_clients", "clients")
-"""All clients of services."""
+"""Sender that stands for all service clients."""
 ANSWER_TIMEOUT: Final = 3600.0
-"""Seconds that a request may wait for its answer: the result of an action comes at its end."""
+"""Maximum time for answering a request (s): the result of an action is available only at its end."""
 THREADS: Final = 64
-"""Maximum number of requests that are answered at once, and one thread for messages: a result of an action occupies one
-until the action ends."""
+"""Maximum number of requests answered in parallel, plus one thread for messages; the result request of an action
+occupies one until the action ends.
+"""
 
 
 def distribution_here() -> str:
-    """Return the one of ``interfaces.DISTRIBUTIONS`` whose interfaces are installed, by ``ROS_DISTRO``."""
+    """Return the entry of ``interfaces.DISTRIBUTIONS`` that is installed, according to ``ROS_DISTRO``."""
     named = os.environ.get("ROS_DISTRO", "jazzy")
     others = {"iron": "jazzy"}
     return named if named in DISTRIBUTIONS else others.get(named, DISTRIBUTIONS[-1])
@@ -56,13 +57,13 @@ def _profile(qos: RosQos) -> QoSProfile:
 
 @dataclass(slots=True)
 class Participant:
-    """A context of ``rclpy`` with one node."""
+    """An ``rclpy`` context with one node."""
 
     context: Context
     node: Node
     executor: MultiThreadedExecutor
     interfaces: dict[str, str] = field(default_factory=dict)
-    """Names of interfaces by topic."""
+    """Interface names by topic."""
 
     def leave(self) -> None:
         """Leave the graph."""
@@ -94,13 +95,13 @@ class RclpyNode:
         self.missing: set[str] = set()
         """Interfaces that are not installed."""
         self._undiscovered: dict[str, asyncio.TimerHandle] = {}
-        """Timers of latched messages whose publisher is not known yet, by topic."""
+        """Timers of latched messages whose publisher is still unknown, by topic."""
 
     async def __aenter__(self) -> Self:
         """Join the graph.
 
         Raises:
-            BusyError: it has a node of this name already.
+            BusyError: the graph already has a node with this name.
         """
         self._loop = asyncio.get_running_loop()
         self._participants = [await in_thread(self._join)]
@@ -146,9 +147,9 @@ class RclpyNode:
         await in_daemon_thread(leave)
 
     def _node_for(self, topic: str, interface: str) -> Any:
-        """The node for a topic with an interface: a participant of DDS has one interface for a topic.
+        """Return the node for a topic with an interface, because a DDS participant has a single interface per topic.
 
-        A second one, such as a stamped ``cmd_vel``, gets a separate participant and node.
+        A second interface, such as a stamped ``cmd_vel``, gets a separate participant and node.
         """
         for participant in self._participants:
             if participant.interfaces.setdefault(topic, interface) == interface:
@@ -157,7 +158,7 @@ class RclpyNode:
         return self._node_for(topic, interface)
 
     def qualified(self, name: str) -> str:
-        """Full name of a topic or service; see ``RosNode``."""
+        """Return the full name of a topic or service; see ``RosNode``."""
         return str(self._node.resolve_topic_name(name))
 
     def present(self, sender: RosSender) -> bool:
@@ -172,7 +173,7 @@ class RclpyNode:
         return found
 
     def publisher(self, topic: str, interface: str, qos: RosQos) -> Publish:
-        """Offer a topic; see ``RosNode``."""
+        """Advertise a topic; see ``RosNode``."""
         kind = self._interface(interface)
         if kind is None:
             return lambda _: None
@@ -199,12 +200,12 @@ class RclpyNode:
         def arrive(arrival: RosArrival) -> None:
             if (waiting := self._undiscovered.pop(topic, None)) is not None:
                 waiting.cancel()
-            if arrival.sender is None and qos.latched:  # sent once, perhaps before the graph has its publisher
+            if arrival.sender is None and qos.latched:  # sent once, possibly before the graph has its publisher
                 self._undiscovered[topic] = self._loop.call_later(1.0, self._discovered, topic, take, arrival)
             else:
                 take(arrival)
 
-        # A queue of 1: only the latest of the waiting messages is used.
+        # Queue length 1: only the latest waiting message is used.
         profile = _profile(RosQos(depth=1, reliable=qos.latched, latched=qos.latched))
         self._node_for(topic, interface).create_subscription(kind, topic, receive, profile, raw=True)
 
@@ -214,14 +215,14 @@ class RclpyNode:
         take(replace(arrival, sender=sender, publisher=gid))
 
     def _publisher_of(self, topic: str) -> tuple[RosSender | None, bytes]:
-        """The publisher of a topic, if it is the only one besides this node."""
+        """Return the publisher of a topic if it is the only one besides this node."""
         own = {participant.node.get_name() for participant in self._participants}
         rows = self._node.get_publishers_info_by_topic(self.qualified(topic))
         named = [(row.node_namespace, row.node_name, bytes(row.endpoint_gid)) for row in rows]
         return sole_publisher(named, self._namespace, own)
 
     def serve(self, service: str, interface: str, answer: Answer) -> None:
-        """Offer a service; see ``RosNode``."""
+        """Advertise a service; see ``RosNode``."""
         kind = self._interface(interface)
         if kind is None:
             return

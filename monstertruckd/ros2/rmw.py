@@ -1,7 +1,7 @@
-"""The wire of ``rmw_zenoh``: keys of topics, tokens of the graph, identities of publishers, attachments of messages.
+"""Wire format of ``rmw_zenoh``: keys of topics, tokens of the graph, identities of publishers, attachments of messages.
 
 Sources: ``docs/design.md`` and ``rmw_zenoh_cpp/src/detail`` of https://github.com/ros2/rmw_zenoh. Releases since
-Humble 0.1.2, Jazzy 0.2.4 and Rolling 0.6.0 have this form of the attachment.
+Humble 0.1.2, Jazzy 0.2.4 and Rolling 0.6.0 use this form of the attachment.
 """
 
 import struct
@@ -35,18 +35,18 @@ class EntityKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class RosQos:
-    """Quality of service, as far as ``rmw_zenoh`` distinguishes it: no two are incompatible."""
+    """Quality of service, as far as ``rmw_zenoh`` distinguishes it; all combinations are compatible."""
 
     depth: int = 10
-    """Messages that are kept for late subscribers, or while a subscriber is busy."""
+    """Number of messages kept for late subscribers, or while a subscriber is busy."""
     reliable: bool = True
     latched: bool = False
     """Transient local: late subscribers receive the latest ``depth`` messages."""
 
     @property
     def text(self) -> str:
-        """Return the form in a token; defaults of ``rmw_zenoh`` are empty."""
-        depth = "" if self.depth == 42 else str(self.depth)  # 42: that default
+        """Return the form in a token, where defaults of ``rmw_zenoh`` are empty."""
+        depth = "" if self.depth == 42 else str(self.depth)  # 42: the default depth
         return f"{'' if self.reliable else 2}:{1 if self.latched else ''}:,{depth}:,:,:,,"
 
 
@@ -56,25 +56,25 @@ LATCHED: Final = RosQos(depth=1, latched=True)
 
 
 def dds_name(interface: str) -> str:
-    """Name of an interface in keys: ``pkg::msg::dds_::Name_``."""
+    """Return the name of an interface in keys: ``pkg::msg::dds_::Name_``."""
     package, group, name = wire_name(interface).split("/")
     return f"{package}::{group}::dds_::{name}_"
 
 
 def data_key(domain: int, name: str, interface: str, *, hashed: bool = True) -> str:
-    """Key of a topic or service.
+    """Return the key of a topic or service.
 
     Args:
         domain: ``ROS_DOMAIN_ID``.
         name: fully qualified, such as ``/truck1/scan``.
-        interface: of the file of interfaces; of a service the service's own.
+        interface: interface of the topic or service, from the interface file.
         hashed: False for Humble.
     """
     return f"{domain}/{name.strip('/')}/{dds_name(interface)}/{type_hash(interface) if hashed else NO_HASH}"
 
 
 def mangled(text: str) -> str:
-    """A name as one chunk of a token."""
+    """Encode a name as one chunk of a token."""
     return text.replace("/", "%") or "%"
 
 
@@ -90,25 +90,25 @@ class RosEntity:
     interface: str = ""
     """``pkg::msg::dds_::Name_``."""
     owner: str = ""
-    """Distinguishes nodes of the same name: session and number of the node."""
+    """Session and number of the node; distinguishes nodes with the same name."""
 
     @property
     def qualified_node(self) -> str:
-        """``/truck1/teleop``."""
+        """Qualified name, such as ``/truck1/teleop``."""
         return f"{self.namespace.rstrip('/')}/{self.node}"
 
 
 def token_key(
     domain: int, session: str, numbers: tuple[int, int], entity: RosEntity, type_and_qos: tuple[str, str] = ("", "")
 ) -> str:
-    """Key of a liveliness token.
+    """Return the key of a liveliness token.
 
     Args:
         domain: ``ROS_DOMAIN_ID``.
         session: id of the Zenoh session.
-        numbers: of the node and of the entity, unique in the session; of a node equal.
+        numbers: numbers of the node and of the entity, unique in the session; equal for a node.
         entity: node, publisher, subscriber, service or client of the token.
-        type_and_qos: type hash and quality of service; of a node not used.
+        type_and_qos: type hash and quality of service; unused for a node.
     """
     node, own = numbers
     chunks = [LIVELINESS, str(domain), session, str(node), str(own), entity.kind.value, "%"]
@@ -119,10 +119,10 @@ def token_key(
 
 
 def parsed_token(key: str) -> RosEntity:
-    """The entity of a token; newer releases may append chunks.
+    """Parse the entity of a token; newer releases may append chunks.
 
     Raises:
-        InputError: it is none.
+        InputError: the key is not a token.
     """
     chunks = key.split("/")
     try:
@@ -137,7 +137,7 @@ def parsed_token(key: str) -> RosEntity:
 
 
 def gid_of(token: str) -> bytes:
-    """Identity of the publisher of a token, as messages carry it: XXH3-128, low half first, little endian."""
+    """Return the GID of a token's publisher, as in its messages: XXH3-128, low half first, little endian."""
     return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(GID_SIZE, "little")
 
 
@@ -146,9 +146,9 @@ class Attachment:
     """Attachment of every message."""
 
     sequence: int
-    """Sequence number of the publisher from 1; a reply repeats the number of its request."""
+    """Sequence number of the publisher, starting at 1; a reply repeats the number of its request."""
     stamp: int
-    """When it was sent, ns since 1970."""
+    """Send time (ns since 1970)."""
     gid: bytes
     """GID of the publisher; a reply has the GID of its client."""
 
@@ -158,10 +158,10 @@ class Attachment:
 
     @classmethod
     def parse(cls, data: bytes | None) -> "Attachment":
-        """Read one.
+        """Parse an attachment.
 
         Raises:
-            InputError: it is missing, or another.
+            InputError: it is missing or malformed.
         """
         if data is None or len(data) != _ATTACHMENT.size:
             raise InputError(f"attachment of {0 if data is None else len(data)} bytes: expected {_ATTACHMENT.size}")

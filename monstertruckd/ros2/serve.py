@@ -1,4 +1,4 @@
-"""Sessions of a face: the robot on one side, ROS 2 on the other."""
+"""Runs the bridge: a session with the robot and a ROS 2 node."""
 
 import json
 import logging
@@ -24,14 +24,14 @@ log = logging.getLogger(__name__)
 RVIZ: Final = Path(__file__).parent / "robot.rviz"
 """Configuration of RViz for one robot without a namespace."""
 TIMEOUT: Final = 2.5
-"""Seconds in which the robot answers."""
+"""Timeout of the robot's answer (s)."""
 
 
 @asynccontextmanager
 async def zenoh_node(
     name: tuple[str, str], domain: int, settings: Mapping[str, Any], clock: Clock, *, hashed: bool
 ) -> AsyncIterator[RosNode]:
-    """A node over ``rmw_zenoh``'s wire; arguments and errors of ``ZenohNode``."""
+    """Open a node on the wire of ``rmw_zenoh``; arguments and errors of ``ZenohNode``."""
     from monstertruckd.ros2.zenoh_node import ZenohNode  # noqa: PLC0415 - each face has libraries of its own
 
     async with ZenohNode(name, domain, settings, clock, hashed=hashed) as node:
@@ -40,7 +40,7 @@ async def zenoh_node(
 
 @asynccontextmanager
 async def rclpy_node(name: tuple[str, str], domain: int) -> AsyncIterator[RosNode]:
-    """A node of the installed ROS 2; arguments and errors of ``RclpyNode``."""
+    """Open a node of the installed ROS 2; arguments and errors of ``RclpyNode``."""
     from monstertruckd.ros2.rclpy_node import RclpyNode  # noqa: PLC0415
 
     async with RclpyNode(name, domain) as node:
@@ -57,18 +57,18 @@ async def serve_face(
     clock: Clock,
     ready: Callable[[], object],
 ) -> None:
-    """Show a robot to ROS 2 until cancelled.
+    """Connect a robot to ROS 2 until cancelled.
 
     Args:
         address: address of the robot.
-        join: makes the node.
-        facts: what ROS 2 needs of the robot's configuration.
-        options: as chosen.
+        join: creates the node.
+        facts: extracts the parts of the robot's configuration for ROS 2.
+        options: options of the user.
         clock: time.
-        ready: called once ROS 2 sees the robot.
+        ready: called once ROS 2 can discover the robot.
 
     Raises:
-        TruckError: the robot or the router cannot be reached, or it has a face already.
+        TruckError: the robot or the router cannot be reached, or the robot already has a bridge.
     """
     remarks = Remarks(log)
     tls = tls_for(address.endpoint)

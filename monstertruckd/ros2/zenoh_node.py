@@ -1,4 +1,4 @@
-"""A ROS 2 node over Zenoh, as ``rmw_zenoh`` has them: no ROS installation is needed on this side."""
+"""ROS 2 node over Zenoh, compatible with ``rmw_zenoh``; needs no ROS installation."""
 
 import asyncio
 import json
@@ -37,11 +37,11 @@ from monstertruckd.ros2.rmw import (
 )
 
 PUBLISHERS: Final = 64
-"""Maximum number of a topic's publishers whose newest message waits; messages of further ones are lost."""
+"""Maximum number of publishers of a topic with a waiting message; messages of further ones are lost."""
 
 
 def session_settings(connect: str | None, listen: str) -> dict[str, Any]:
-    """Configuration of the node's Zenoh session.
+    """Return the configuration of the node's Zenoh session.
 
     Args:
         connect: endpoint of a running Zenoh router such as ``rmw_zenohd``; None: the node is the router itself.
@@ -59,13 +59,13 @@ def session_settings(connect: str | None, listen: str) -> dict[str, Any]:
 
 
 def free_endpoint(listen: str) -> str:
-    """The endpoint, or the same with the next free port: ``rmw_zenohd`` and the robot's daemon have one default.
+    """Return the endpoint, or the same with the next free port: ``rmw_zenohd`` and the daemon share a default port.
 
     Raises:
         BusyError: none of the next ports is free.
     """
     protocol, host, first = protocol_of(listen), host_of(listen), port_of(listen) or 0
-    ports = 10  # ports that are tried for the first that is free
+    ports = 10  # number of ports tried
     for port in range(first, first + ports):
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -78,12 +78,12 @@ def free_endpoint(listen: str) -> str:
 
 
 class _Discovery:
-    """Hold a message that arrives before the token of its publisher: latched messages are sent only once.
+    """Holds messages that arrive before the token of their publisher, because latched messages are sent only once.
 
     Args:
         loop: event loop.
-        sender_of: publisher with an identity; None if the graph has none.
-        deliver: takes the message, after at most a second.
+        sender_of: returns the publisher with a GID; None if the graph has none.
+        deliver: called with the message, after at most a second.
     """
 
     def __init__(
@@ -91,10 +91,10 @@ class _Discovery:
     ) -> None:
         self._loop, self._sender_of, self._deliver = loop, sender_of, deliver
         self._early: dict[bytes, RosArrival] = {}
-        """By publisher."""
+        """Waiting messages by publisher."""
 
     def take(self, arrival: RosArrival) -> None:
-        """Deliver a message now or later; a newer one of its publisher replaces it."""
+        """Deliver a message now or later; a newer message of its publisher replaces a waiting one."""
         self._early.pop(arrival.publisher, None)
         if arrival.sender is None and len(self._early) < PUBLISHERS:
             self._early[arrival.publisher] = arrival
@@ -114,7 +114,7 @@ class ZenohNode:
     Args:
         name: name of the node, and its namespace, ``/`` or ``/truck1``.
         domain: ``ROS_DOMAIN_ID``.
-        settings: as by ``session_settings``.
+        settings: result of ``session_settings``.
         clock: time.
         hashed: False for Humble.
     """
@@ -132,9 +132,9 @@ class ZenohNode:
         self._graph: dict[str, RosEntity] = {}
         """Entities by their token."""
         self._gids: dict[bytes, str] = {}
-        """Tokens by identity."""
+        """Tokens by GID."""
         self._kept: list[Any] = []
-        """Declarations of Zenoh, which end when they are dropped."""
+        """Zenoh declarations, which end when they are dropped."""
         self._answering: set[asyncio.Task[None]] = set()
         self.malformed = 0
 
@@ -142,8 +142,8 @@ class ZenohNode:
         """Join the graph.
 
         Raises:
-            BusyError: it has a node of this name already.
-            NotFoundError: no router answers, or the endpoint cannot be listened at.
+            BusyError: the graph already has a node with this name.
+            NotFoundError: no router answers, or the endpoint is not available.
         """
         self._loop = asyncio.get_running_loop()
         text = json.dumps(self._settings)
@@ -152,7 +152,7 @@ class ZenohNode:
         except zenoh.ZError as error:
             places = self._settings.get("connect", self._settings.get("listen", {})).get("endpoints")
             raise NotFoundError(f"no Zenoh session for ROS 2 at {', '.join(places or ())}: {error}") from None
-        graph = 100_000  # changes of the graph that may wait
+        graph = 100_000  # maximum number of pending graph changes
         hop: ThreadHop[tuple[str, bool]] = ThreadHop(self._seen, graph, lambda _: None)
         try:
             await in_thread(partial(self._join, hop))
@@ -210,12 +210,12 @@ class ZenohNode:
         return any(entity.owner == sender.key for entity in self._graph.values())
 
     def qualified(self, name: str) -> str:
-        """Full name of a topic or service; see ``RosNode``."""
+        """Return the full name of a topic or service; see ``RosNode``."""
         name = name.replace("~", self._name, 1) if name.startswith("~/") else name
         return name if name.startswith("/") else f"{self._namespace.rstrip('/')}/{name}"
 
     def _token(self, kind: EntityKind, topic: str = "", interface: str = "", qos: RosQos = RELIABLE) -> bytes:
-        """Declare an entity; returns its identity."""
+        """Declare an entity; return its GID."""
         own = self._entities
         self._entities += 1
         described = dds_name(interface) if interface else ""
@@ -234,13 +234,13 @@ class ZenohNode:
     # Topics
 
     def publisher(self, topic: str, interface: str, qos: RosQos) -> Publish:
-        """Offer a topic; see ``RosNode``."""
+        """Advertise a topic; see ``RosNode``."""
         name = self.qualified(topic)
         more: dict[str, Any] = {}
         if qos.latched:
             more = {"cache": ext.CacheConfig(qos.depth), "publisher_detection": True}
             if qos.reliable:
-                # 0.5: seconds between two heartbeats, as rmw_zenoh has it
+                # 0.5: interval between two heartbeats (s), as in rmw_zenoh
                 more["sample_miss_detection"] = ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5)
         publisher = ext.declare_advanced_publisher(
             self._session, self._key(name, interface), congestion_control=zenoh.CongestionControl.DROP, **more
@@ -261,7 +261,7 @@ class ZenohNode:
         """Receive a topic; see ``RosNode``."""
         name = self.qualified(topic)
         newest: dict[bytes, tuple[Attachment, bytes]] = {}
-        """By publisher; filled by the thread that reads the network, emptied by the loop."""
+        """Latest message by publisher; the network thread fills it, the event loop empties it."""
         lock = threading.Lock()
         sender_of = partial(self._sender, topic=name, interface=interface, kind=EntityKind.PUBLISHER)
         if qos.latched:
@@ -311,14 +311,14 @@ class ZenohNode:
     # Services
 
     def serve(self, service: str, interface: str, answer: Answer) -> None:
-        """Offer a service; see ``RosNode``."""
+        """Advertise a service; see ``RosNode``."""
         name = self.qualified(service)
         key = self._key(name, interface)
-        requests = 64  # requests of a service that may wait; the oldest is lost
+        requests = 64  # maximum number of pending requests of a service; the oldest is dropped
         hop: ThreadHop[zenoh.Query] = ThreadHop(
             partial(self._request, key, name, interface, answer), requests, lambda _: None
         )
-        # Clients ask with target ALL_COMPLETE.
+        # Clients query with target ALL_COMPLETE.
         self._kept.append(self._session.declare_queryable(key, hop.put, complete=True))
         self._token(EntityKind.SERVICE, name, interface)
 

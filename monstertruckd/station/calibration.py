@@ -1,4 +1,4 @@
-"""Calibration of a robot from a browser: a wizard's sentences, questions, progress and result."""
+"""Calibration of a robot from a browser: a wizard's messages, questions, progress and result."""
 
 import asyncio
 from collections import deque
@@ -18,7 +18,7 @@ from monstertruckd.station.viewer import Viewer
 TIMEOUT: Final = 10.0
 """Timeout of the robot's answer (s): its daemon writes files."""
 SAID: Final = 30
-"""Maximum number of a wizard's sentences shown."""
+"""Maximum number of messages of a wizard shown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,39 +26,39 @@ class Measured:
     """Result of a wizard, not yet saved."""
 
     rows: Sequence[dict[str, Any]]
-    """Estimates: name, unit, meaning, value, low, high, grade, and those ``before`` with their interval."""
+    """Estimates: name, unit, meaning, value, low, high, grade, and the values ``before`` with their interval."""
     measured: str
-    """Summary of the measurement, in a sentence."""
+    """Summary of the measurement, as a sentence."""
     save: Callable[[], Awaitable[str]]
-    """Saves it; returns where, for people."""
+    """Saves the result; returns the location as text for the operator."""
 
 
 class Calibrator(Protocol):
-    """The wizards, which the station does not know."""
+    """Interface to the calibration wizards."""
 
     async def offered(self, truck: TruckClient) -> list[dict[str, Any]]:
         """Return the wizards for this robot, in the recommended order: id, name, doc, options, whether due."""
 
     async def measure(self, truck: TruckClient, step: str, options: Mapping[str, Any], panel: "PagePanel") -> Measured:
-        """Run one of them, with other options than its defaults.
+        """Run a wizard; ``options`` override its defaults.
 
         Raises:
-            TruckError: it ended without a result.
+            TruckError: the wizard ended without a result.
         """
 
 
 class PagePanel:
-    """A wizard's operator at a browser.
+    """Connects a wizard with the operator at a browser.
 
     Args:
-        show: is called after every change.
+        show: called after every change.
     """
 
     def __init__(self, show: Callable[[], object]) -> None:
         self._show = show
         self.said: deque[str] = deque(maxlen=SAID)
         self.bar: dict[str, Any] | None = None
-        """Progress of the step under way."""
+        """Progress of the current step."""
         self.drawn: dict[str, Any] | None = None
         """Plot of the measurements."""
         self.question: dict[str, Any] | None = None
@@ -66,18 +66,18 @@ class PagePanel:
         self._answer: asyncio.Future[float | bool] | None = None
 
     def say(self, text: str) -> None:
-        """Show a sentence."""
+        """Show a message."""
         self.bar = None
         self.said.append(text)
         self._show()
 
     def progress(self, name: str, done: float, total: float) -> None:
-        """Move the bar of a step."""
+        """Update the progress bar of a step."""
         self.bar = {"name": name, "done": round(min(done, total), 3), "total": total}
         self._show()
 
     def plot(self, plot: Any) -> None:
-        """Show measurements; ``plot`` has a name, labels of both axes, points and perhaps a curve."""
+        """Show measurements; ``plot`` has a name, labels of both axes, points and optionally a curve."""
         self.drawn = {
             "name": plot.name,
             "x": plot.x,
@@ -88,7 +88,7 @@ class PagePanel:
         self._show()
 
     async def number(self, step: Any) -> float:
-        """Ask for a number; ``step`` has its name, question and bounds."""
+        """Ask for a number; ``step`` has a name, a question and bounds."""
         return float(await self._ask(kind="number", name=step.name, text=step.question, low=step.low, high=step.high))
 
     async def confirm(self, step: Any) -> bool:
@@ -110,7 +110,7 @@ class PagePanel:
         """Answer the question.
 
         Raises:
-            InputError: nothing is asked, or the number is out of its bounds.
+            InputError: no question is pending, or the number is out of bounds.
         """
         question = self.question
         if question is None or self._answer is None or self._answer.done():
@@ -165,15 +165,15 @@ class Calibration:
         return self._address.session(self._program, self._clock, TIMEOUT)
 
     async def offer(self) -> list[dict[str, Any]]:
-        """Return the wizards; raises TruckError as the robot does."""
+        """Return the wizards; raises TruckError if the robot refuses or is absent."""
         async with self._session() as truck:
             return await self._calibrator.offered(truck)
 
     def begin(self, step: str, options: Mapping[str, Any]) -> None:
-        """Start a wizard, with other options than its defaults.
+        """Start a wizard; ``options`` override its defaults.
 
         Raises:
-            InputError: one runs already.
+            InputError: a wizard is already running.
         """
         if self._task is not None and not self._task.done():
             raise InputError(f"calibration {self._step} is already running")
@@ -182,7 +182,7 @@ class Calibration:
         self._task = asyncio.create_task(self._run(step, options), name=f"calibration {step}")
 
     def answer(self, value: float | bool) -> None:
-        """Answer the wizard's question; raises the errors of ``PagePanel.answer`` does."""
+        """Answer the wizard's question; raises the errors of ``PagePanel.answer``."""
         self._panel.answer(value)
 
     def decide(self, *, accept: bool) -> None:
@@ -199,7 +199,7 @@ class Calibration:
             self._task.cancel()
 
     def end(self) -> asyncio.Task[None] | None:
-        """End a wizard that runs; nothing is saved. Returns its task."""
+        """Cancel a running wizard without saving; return its task."""
         if self._task is not None:
             self._task.cancel()
         return self._task
@@ -228,7 +228,7 @@ class Calibration:
 
 
 def _thinned(points: Any) -> list[list[float]]:
-    """At most 200 finite points, shape (n, 2), as a plot 300 pixels wide can show them; the last one is kept."""
+    """Return at most 200 finite points, shape (n, 2), for a plot 300 pixels wide, including the last one."""
     points = points[np.isfinite(points).all(axis=1)]
     step = -(-len(points) // 200)
     return [[float(f"{value:.5g}") for value in point] for point in points[::-1][::step][::-1]] if step else []

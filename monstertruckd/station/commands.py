@@ -33,7 +33,7 @@ class _Command(BaseModel):
 
 
 class Asked(_Command):
-    """Command whose outcome is reported to the browser."""
+    """Command that reports its outcome to the browser."""
 
     id: Id
 
@@ -130,7 +130,7 @@ class DoMission(Asked):
     text: Annotated[str, Field(max_length=LONGEST_MESSAGE)] = ""
     """Mission file (YAML), for a start."""
     moved: bool = False
-    """For a resume: the robot is not where the mission was interrupted, and its pose is right."""
+    """Whether to resume although the robot is not where the mission was interrupted; its pose must be right."""
 
 
 class Track(Asked):
@@ -148,7 +148,7 @@ class TrackFile(Asked):
     """Name of the file; its suffix selects table or YAML."""
     text: Annotated[str, Field(max_length=LONGEST_MESSAGE)]
     closed: bool = False
-    """The path is a lap."""
+    """Whether the path is a lap."""
 
 
 class StartPath(Asked):
@@ -166,7 +166,7 @@ class ChangeZone(Asked):
     name: Annotated[str, Field(max_length=32)]
     area: ZoneArea | None = None
     seconds: Annotated[float, Field(gt=0, le=LONGEST_OFF)] = OFF_FOR
-    """How long the zone is off (s)."""
+    """Time for which the zone is off (s)."""
 
 
 class ChangePoint(Asked):
@@ -176,9 +176,9 @@ class ChangePoint(Asked):
     order: PointOrder
     name: PointName
     place: tuple[Number, Number] | None = None
-    """Place of a mark (m); None for the robot's."""
+    """Position of the mark (m); None for the robot's position."""
     yaw: Heading | None = None
-    """Heading of a mark (rad); None for the robot's."""
+    """Heading of the mark (rad); None for the robot's heading."""
 
 
 class AskToDrive(Asked):
@@ -262,23 +262,23 @@ class Calibrate(Asked):
     step: Annotated[str, Field(max_length=100)] = ""
     """Wizard to start."""
     options: Annotated[dict[Name, Number | bool | Name], Field(max_length=32)] = Field(default_factory=dict)
-    """Its options other than the defaults."""
+    """Options of the wizard that override the defaults."""
     value: Number | bool = False
-    """Answer: a number, or yes."""
+    """Answer: a number, or True for yes."""
 
 
 class ListNumbers(Asked):
-    """List the numbers that may be plotted."""
+    """List the numbers that can be plotted."""
 
     do: Literal["numbers"]
 
 
 class PlotNumbers(Asked):
-    """Send the values of these numbers from now on, instead of those chosen before."""
+    """Send the values of these numbers from now on, instead of the previous selection."""
 
     do: Literal["plot"]
     set: Id
-    """Number of this choice, which its values carry."""
+    """Number of this selection, which its values carry."""
     names: Annotated[tuple[Annotated[str, Field(max_length=100)], ...], Field(max_length=100)]
 
 
@@ -330,7 +330,7 @@ _COMMANDS: Final[TypeAdapter[AnyCommand]] = TypeAdapter(Command)
 
 
 LOOKING: Final = Watch | LookAtFleet | EchoRequest | ControlReplay | ListNumbers | PlotNumbers
-"""Commands that reach no robot."""
+"""Commands that do not reach a robot."""
 
 
 def needed(command: AnyCommand) -> AccessRole:

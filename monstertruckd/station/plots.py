@@ -1,4 +1,4 @@
-"""Numbers of messages over time, for the plots of the page: which there are, and their values tick by tick."""
+"""Numbers in messages over time, for the plots of the page: their names, and their values at every tick."""
 
 import types
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -24,9 +24,8 @@ HEADER: Final = frozenset(Message.model_fields)
 
 @cache
 def numbers() -> Mapping[str, str]:
-    """Return the meaning of every number of every topic, by its name ``topic:field.field``; "" where none is written.
-
-    Numbers in lists are left out: their count changes.
+    """Return the meaning of every number by its name ``topic:field.field``; "" if it has none. Numbers
+    in lists are omitted, because their count changes.
     """
     return {
         f"{topic.name}:{path}": meaning
@@ -59,7 +58,7 @@ def _plain_type(annotation: Any) -> Any:
 
 
 def require_numbers(names: Iterable[str]) -> None:
-    """Check the request of a browser.
+    """Check the names requested by a browser.
 
     Raises:
         InputError: a name is not among ``numbers``.
@@ -70,7 +69,7 @@ def require_numbers(names: Iterable[str]) -> None:
 
 
 def value_in(message: Message, path: str) -> float | None:
-    """Return the number at ``path``; None where it is absent."""
+    """Return the number at ``path``; None if it is absent."""
     value: Any = message
     for name in path.split("."):
         value = getattr(value, name, None)
@@ -78,11 +77,11 @@ def value_in(message: Message, path: str) -> float | None:
 
 
 class Subscriptions:
-    """Latest messages of the plotted topics; a topic is subscribed to when it is first asked for.
+    """Latest messages of the plotted topics; a topic is subscribed to at its first use.
 
     Args:
         subscribe: opens a mailbox of a topic.
-        stack: closes them all.
+        stack: closes all mailboxes.
     """
 
     def __init__(self, subscribe: Callable[[Topic[Any], Any], Mailbox[Any]], stack: ExitStack) -> None:
@@ -109,7 +108,7 @@ class Sampler:
         self._taken: dict[str, Message] = {}
 
     def sample(self, viewers: Iterable[Viewer]) -> None:
-        """Send the values since the last call: one for each plotted number, None if no message came."""
+        """Send the values since the last call: one for each plotted number, None without a new message."""
         plotting = [viewer for viewer in viewers if viewer.plotted]
         wanted = {name.partition(":")[0] for viewer in plotting for name in viewer.plotted}
         found = ((topic, self._newest(topic)) for topic in sorted(wanted))

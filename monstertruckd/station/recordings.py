@@ -15,18 +15,18 @@ async def fetch_recording(
 ) -> int:
     """Fetch a recording into a file, resuming an earlier part; return its size in bytes.
 
-    The robot sets the rate.
+    The robot limits the rate.
 
     Args:
         truck: the robot.
         name: name of the recording.
-        to: file, made with the first bytes.
-        progress: gets the share that is there, 0..1.
+        to: file; created with the first bytes.
+        progress: called with the fraction fetched, 0..1.
         most: maximum size (bytes); None for no limit.
 
     Raises:
-        InputError: it is larger than that, or the file holds more than it, or something else.
-        TruckError: the robot refuses, is not there, or has no such recording.
+        InputError: the recording is larger than ``most``, or the existing file is longer or different.
+        TruckError: the robot refuses, is absent, or has no such recording.
     """
     held = await in_thread(lambda: to.stat().st_size if to.exists() else 0)
     at = max(held - 4096, 0)  # bytes of the earlier part that are compared with the robot's before resuming
@@ -57,7 +57,7 @@ def _read(file: Path, at: int) -> bytes:
 
 
 def put(file: Path, at: int, data: bytes) -> None:
-    """Write at a place: a write that was given up may still be under way."""
+    """Write at an offset; an earlier, abandoned write may still be running."""
     file.touch()
     with file.open("r+b") as part:
         part.seek(at)
