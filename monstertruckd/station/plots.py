@@ -24,8 +24,9 @@ HEADER: Final = frozenset(Message.model_fields)
 
 @cache
 def numbers() -> Mapping[str, str]:
-    """Return the meaning of every number by its name ``topic:field.field``; "" if it has none. Numbers
-    in lists are omitted, because their count changes.
+    """Return the meaning of every number by its name ``topic:field.field``; "" if it has none.
+
+    Numbers in lists are omitted, because their count changes.
     """
     return {
         f"{topic.name}:{path}": meaning

@@ -1,4 +1,4 @@
-"""A drive as a moving picture: the robot from above, its path, and the echoes of lidar or sonars so far."""
+"""Animation of a drive: the robot from above, its path, and the lidar or sonar echoes so far."""
 
 import math
 from dataclasses import dataclass, field
@@ -38,28 +38,28 @@ PAPER, WALL, PLANNED, DRIVEN, BEAM, BODY, TEXT = COLOURS
 
 @dataclass(slots=True)
 class AnimationFrame:
-    """Additions of one picture."""
+    """Data added by one frame."""
 
     seconds: float
-    """Since the log's begin."""
+    """Time since the start of the log (s)."""
     pose: tuple[float, float, float]
-    """Base in map (m, rad)."""
+    """Pose of base in map (m, rad)."""
     speed: float
-    """M/s."""
+    """Speed (m/s)."""
     points: Array
-    """Returns of the latest scan in map, or the middles of ``arcs``, shape (n, 2) (m)."""
+    """Returns of the latest scan in map, or the centres of ``arcs``, shape (n, 2) (m)."""
     path: Array
     """Poses of the current path, shape (n, 3)."""
     arcs: list[Array]
-    """Arcs of the sonars' latest echoes, in map, each of shape (n, 2) (m)."""
+    """Arcs of the latest sonar echoes in map, each of shape (n, 2) (m)."""
 
 
 @dataclass(slots=True)
 class _Gathering:
-    """Reads a log in its order; keeps one scene per period."""
+    """Reads a log in order and keeps one frame per period."""
 
     period: int
-    """Log time (ns)."""
+    """Period (ns of log time)."""
     scans: PlacedScans = field(default_factory=PlacedScans)
     scenes: list[AnimationFrame] = field(default_factory=list)
     odometry: Odometry | None = None
@@ -67,7 +67,7 @@ class _Gathering:
     path: Array = field(default_factory=lambda: np.zeros((0, 3)))
     arcs: list[Array] = field(default_factory=list)
     scanned: bool = False
-    """Whether the log has scans, which show more than echoes."""
+    """Whether the log has scans, which take precedence over echoes."""
     began: int | None = None
     due: int = 0
 
@@ -108,14 +108,14 @@ def animate(
         reader: reader of the log.
         output: the file.
         speed: ratio of log time to display time.
-        width: pixels.
+        width: width (pixels).
         report: called with the bytes read.
 
     Returns:
-        ``frames`` and ``seconds`` of the picture, ``bytes`` of the file.
+        ``frames`` and ``seconds`` of the animation, ``bytes`` of the file.
 
     Raises:
-        InputError: the log holds no pose, a robot's size that cannot be, or too many pictures at this speed;
+        InputError: the log has no pose or an invalid robot size, or the animation has too many frames at this speed;
             ``output`` is a log or not a GIF.
         CommandFailedError: the file cannot be written.
     """
@@ -142,7 +142,7 @@ def animate(
 
 
 def _scenes(reader: LogReader, period: int, report: Progress) -> list[AnimationFrame]:
-    """Poses in map, or of odometry if the log has no others."""
+    """Return the frames, with poses in map, or in odom if the log has no others."""
     for pose in (POSE.name, ODOMETRY.name):
         gathering = _Gathering(period)
         wanted = {pose, SCAN.name, SONAR.name, PATH.name, TRANSFORMS.name}
@@ -160,11 +160,11 @@ def _scenes(reader: LogReader, period: int, report: Progress) -> list[AnimationF
 
 
 class _AnimationCanvas:
-    """Draws scenes; what lidar or sonars saw stays.
+    """Draws frames; lidar and sonar echoes accumulate.
 
     Args:
-        scenes: all of them, for the section that is shown.
-        width: pixels.
+        scenes: all frames, which define the visible area.
+        width: width (pixels).
         geometry: geometry of the truck.
     """
 
@@ -183,7 +183,7 @@ class _AnimationCanvas:
         self._driven: list[tuple[float, float]] = []
 
     def frame(self, scene: AnimationFrame) -> Image.Image:
-        """The next picture."""
+        """Return the next frame."""
         ground = ImageDraw.Draw(self._ground)
         for x, y in self._pixels(scene.points):
             ground.point((x, y), WALL)
@@ -205,6 +205,6 @@ class _AnimationCanvas:
         return picture.quantize(palette=self._palette, dither=Image.Dither.NONE)
 
     def _pixels(self, points: Array) -> list[tuple[float, float]]:
-        """Bounds of points in map, shape (n, 2) (m)."""
+        """Convert points in map, shape (n, 2) (m), to pixels."""
         scaled = (points - self._low) * self._scale
         return [(x, self._height - y) for x, y in scaled.tolist()]

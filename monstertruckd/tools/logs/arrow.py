@@ -1,7 +1,7 @@
-"""Messages of a log as Arrow tables: a column per field, arrays as lists, bounded batches; Parquet files of them.
+"""Messages of a log as Arrow tables, with a column per field, in batches of bounded size; and as Parquet files.
 
-Nested records are dotted columns, as in the other tables. Lists of records are lists of structs; a mapping to numbers
-is a map, any other mapping is JSON text. Absent values are null.
+Fields of nested records have dotted column names, as in the other tables. Lists of records are lists of structs; a
+mapping to numbers is a map, any other mapping is JSON text. Absent values are null.
 """
 
 import json
@@ -29,12 +29,12 @@ from monstertruckd.tools.logs.messages import ALL, Progress, Selection, real_off
 BATCH_BYTES: Final = 4_000_000
 """Encoded messages of a batch (bytes): a few hundred scans, whose rows take a few ten MB."""
 BATCH_ROWS: Final = 16_384
-"""Rows of a batch at most: small messages take a hundred times their encoded size as rows."""
+"""Maximum number of rows in a batch: small messages take a hundred times their encoded size as rows."""
 
 
 @cache
 def schema_of(topic: str) -> pa.Schema:
-    """The columns of a topic's table."""
+    """Return the columns of a topic's table."""
     times = [(LOG_TIME, pa.int64()), (REAL_TIME, pa.timestamp("ns", tz="UTC"))]
     return pa.schema([*times, *_columns(BY_NAME[topic].model, "")])
 
@@ -69,7 +69,7 @@ def _type(annotation: Any) -> pa.DataType:
 
 
 def _value(value: Any, kind: pa.DataType) -> Any:
-    """The value as Arrow takes it for a column of this kind."""
+    """Convert a value for a column of this type."""
     if isinstance(value, dict):
         return list(value.items()) if pa.types.is_map(kind) else json.dumps(value)
     if isinstance(value, Enum):
@@ -82,7 +82,7 @@ def _value(value: Any, kind: pa.DataType) -> Any:
 
 
 class _Batch:
-    """Rows of one topic on their way to a batch; only the wanted columns are kept."""
+    """Rows of one topic, collected to a batch; only the selected columns are kept."""
 
     def __init__(self, topic: str, columns: Sequence[str]) -> None:
         full = schema_of(topic)
@@ -101,7 +101,7 @@ class _Batch:
         return self._bytes >= BATCH_BYTES or self._rows >= BATCH_ROWS
 
     def take(self) -> pa.RecordBatch:
-        """The rows so far, which are then forgotten.
+        """Return the rows so far and clear them.
 
         Raises:
             InputError: a number has more than 64 bits.
@@ -121,12 +121,12 @@ def batches(
     columns: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Iterator[tuple[str, pa.RecordBatch]]:
-    """Topic and batch of rows, in the order of the log for each topic, in bounded memory.
+    """Yield topic and batch of rows, in log order within each topic, in bounded memory.
 
     Args:
         path: the log.
-        selection: which messages.
-        columns: names of the wanted ones; empty: all.
+        selection: selected messages.
+        columns: selected columns; empty: all.
         progress: called with the bytes read.
 
     Raises:
@@ -149,12 +149,12 @@ def batches(
 def windows(
     path: str | Path | LogReader, selection: Selection, columns: Mapping[str, Sequence[str]], seconds: float
 ) -> Iterator[dict[str, pa.Table]]:
-    """Yield the rows of each topic, window by window of a log; windows without a row are left out.
+    """Yield the rows of each topic, window by window of a log; windows without a row are omitted.
 
     Args:
         path: the log.
-        selection: which messages; names the topics.
-        columns: names of the wanted ones by topic; empty: all.
+        selection: selected messages, with the topics.
+        columns: selected columns by topic; empty: all.
         seconds: length of a window, by log time; infinite = one window.
 
     Raises:
@@ -185,7 +185,7 @@ def windows(
 
 
 def _row(entry: LogMessage, message: Message, offset: int) -> dict[str, Any]:
-    """The columns of a message; ``offset`` is real minus daemon time (ns)."""
+    """Return the columns of a message; ``offset`` is real minus daemon time (ns)."""
     times = {LOG_TIME: entry.log_time, REAL_TIME: entry.log_time + offset}
     return {**times, **flat(message, type(message), "")}
 

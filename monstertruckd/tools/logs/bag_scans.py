@@ -1,4 +1,4 @@
-"""The scan log of a bag: which topics, which frames, whose odometry."""
+"""Scans of a bag: selection of topics, frames and odometry."""
 
 import itertools
 import math
@@ -28,27 +28,27 @@ from monstertruckd.tools.logs.scan_log import (
 )
 
 ODOM: Final = "odom"
-"""Part of the names of frames that odometry has its poses in (REP 105: ``odom``)."""
+"""Part of the name of an odometry frame (REP 105: ``odom``)."""
 MAP: Final = "map"
 """Frame of poses that are not odometry (REP 105)."""
 BASES: Final = ("base_footprint", "base_link", "base")
-"""Names of the robot's frame (REP 105, and ours)."""
+"""Names of the robot's frame (REP 105, and this project's)."""
 
 
 def scans_of(path: Path, make: str, content: BagContent, given: dict[str, Any], topics: tuple[str, ...]) -> ScanLog:
-    """Make the scans of a bag, with odometry at their times.
+    """Return the scans of a bag, with odometry at their times.
 
-    Odometry comes from a topic, else from the transforms from a frame named like ``odom`` to base.
+    Odometry comes from a topic, otherwise from the transforms between an odometry frame and base.
 
     Args:
-        path: the bag, for refusals.
+        path: path of the bag, for error messages.
         make: kind of log.
-        content: content of it.
+        content: content of the bag.
         given: geometry; overrides the bag.
-        topics: choice of scans and odometry where there are several.
+        topics: selection among several topics of scans and odometry.
 
     Raises:
-        InputError: no scans, several topics of them, a topic that holds something else, or a lidar that is not level.
+        InputError: no scans, several topics of them, a topic of another type, or a lidar that is not level.
     """
     topic = _scan_topic(path, content, topics)
     found = content.scans[topic]
@@ -88,10 +88,10 @@ def scans_of(path: Path, make: str, content: BagContent, given: dict[str, Any], 
 
 
 def _scan_topic(path: Path, content: BagContent, topics: tuple[str, ...]) -> str:
-    """The topic of the scans.
+    """Return the topic of the scans.
 
     Raises:
-        InputError: there is none, or not one.
+        InputError: there is none, or more than one.
     """
     for topic in topics:
         if topic in content.others:
@@ -109,7 +109,7 @@ def _scan_topic(path: Path, content: BagContent, topics: tuple[str, ...]) -> str
 
 
 def _odometry_topic(content: BagContent, topics: tuple[str, ...], chain: list[str]) -> str | None:
-    """The topic of the odometry: a chosen one, else one of the frame that carries the lidar, else the longest."""
+    """Return the odometry topic: the selected one, otherwise that of the lidar's robot frame, otherwise the longest."""
     found = [topic for topic in topics if topic in content.odometry]
     local = [topic for topic, poses in content.odometry.items() if poses[0].parent != MAP]
 
@@ -121,7 +121,7 @@ def _odometry_topic(content: BagContent, topics: tuple[str, ...], chain: list[st
 
 
 def _base(chain: list[str]) -> str:
-    """The robot's frame among those that carry the lidar: below ``odom``, else by its name, else the last one."""
+    """Return the robot's frame in the lidar's chain: the one below ``odom``, otherwise by name, otherwise the last."""
     for below, above in itertools.pairwise(chain):
         if ODOM in above:
             return below
@@ -141,25 +141,25 @@ def _odometry(poses: list[BagPose], clock: int) -> OdometryLog:
 
 
 def _in_order(stamps: NDArray[np.int64], poses: Array) -> OdometryLog:
-    """Odometry by rising stamps; of several poses at one stamp the first."""
+    """Return the odometry by increasing stamps; of several poses with one stamp, the first."""
     rising, kept = np.unique(stamps, return_index=True)
     return OdometryLog(rising, poses[kept].reshape(-1, 3))
 
 
 def _limits(found: list[BagScan]) -> dict[str, float]:
-    """Minimum and maximum range from the first message; empty if it gives none."""
+    """Return minimum and maximum range from the first message; empty if it has none."""
     limits = found[0].limits
     return {} if limits is None or not limits[0] < limits[1] else {"range_min": limits[0], "range_max": limits[1]}
 
 
 def _furthest(found: list[BagScan]) -> float:
-    """Range without a return, if no message gives it; infinity if nothing returned."""
+    """Return the range that means no return, if no message gives it; infinity if all beams have returns."""
     ranges = np.concatenate([scan.ranges for scan in found])
     return no_return(ranges) if np.isfinite(ranges).any() else math.inf
 
 
 def _scan(scan: BagScan, stamp: int, *, mirrored: bool, geometry: dict[str, Any]) -> ScanInput:
-    """A scan with its own angles; a lidar that hangs upside down reverses them."""
+    """Convert a scan, with its own angles; for a lidar mounted upside down they are reversed."""
     sign = -1.0 if mirrored else 1.0
     own = {
         "start_angle": sign * scan.start_angle,
@@ -179,14 +179,14 @@ class _Edge:
     """Shape (n, 4, 4)."""
 
     def at(self, stamps: NDArray[np.int64]) -> Array:
-        """Latest poses by then, or the first ones, shape (len(stamps), 4, 4)."""
+        """Return the latest poses at these times, or the first ones, shape (len(stamps), 4, 4)."""
         newest = np.searchsorted(self.stamps, stamps, side="right") - 1
         return self.poses[np.maximum(newest, 0)]
 
 
 @dataclass(frozen=True, slots=True)
 class _Frames:
-    """The tree of frames of a bag."""
+    """Frame tree of a bag."""
 
     edges: dict[str, _Edge]
 
@@ -203,21 +203,21 @@ class _Frames:
         return cls(edges)
 
     def chain(self, frame: str) -> list[str]:
-        """The frame, its parent, the parent's parent, and so on."""
+        """Return the frame, its parent, the parent's parent, and so on."""
         names = [frame]
         while (edge := self.edges.get(names[-1])) is not None and edge.parent not in names:
             names.append(edge.parent)
         return names
 
     def pose(self, chain: list[str], base: str, stamps: NDArray[np.int64]) -> Array:
-        """Pose of the chain's first frame in ``base`` at these stamps, shape (n, 4, 4)."""
+        """Return the pose of the chain's first frame in ``base`` at these stamps, shape (n, 4, 4)."""
         poses = np.broadcast_to(np.eye(4), (len(stamps), 4, 4))
         for frame in chain[: chain.index(base)]:
             poses = self.edges[frame].at(stamps) @ poses
         return poses
 
     def odometry(self, chain: list[str], base: str) -> OdometryLog:
-        """Poses of ``base`` in the frame of odometry above it, at the stamps of the edge that moves most often."""
+        """Return the poses of ``base`` in the odometry frame above it, at the stamps of the most frequent transform."""
         above = chain[chain.index(base) :]
         origin = next((frame for frame in above[1:] if ODOM in frame), None)
         if origin is None:

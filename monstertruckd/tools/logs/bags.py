@@ -1,4 +1,4 @@
-"""Scans, odometry and frames out of bags and MCAP files by others: messages of ROS and Foxglove."""
+"""Scans, odometry and frames from bags and MCAP files of other programs: ROS and Foxglove messages."""
 
 import json
 import math
@@ -19,29 +19,29 @@ from monstertruck_runtime.outside import reading
 from monstertruckd.recorder.reader import joined
 
 METADATA: Final = "metadata.yaml"
-"""File that makes a folder a bag of ROS 2."""
+"""File that identifies a folder as a ROS 2 bag."""
 SCANS: Final = "foxglove.LaserScan or sensor_msgs/LaserScan"
 """Messages that are read as scans."""
 
 
 @dataclass(frozen=True, slots=True)
 class MessageTimes:
-    """MessageTimes of one message (ns)."""
+    """Times of one message (ns)."""
 
     stamp: int
     """Stamp in its header."""
     logged: int
-    """Time of its recording."""
+    """Time of recording."""
 
 
 @dataclass(frozen=True, slots=True)
 class BagScan:
-    """One scan as its message has it."""
+    """One scan as in its message."""
 
     times: MessageTimes
     frame: str
     pose: Array
-    """Shape (4, 4): origin of the beams in ``frame``."""
+    """Origin of the beams in ``frame``, shape (4, 4)."""
     start_angle: float
     angle_increment: float
     time_increment: float
@@ -70,17 +70,17 @@ class BagContent:
     odometry: dict[str, list[BagPose]] = field(default_factory=dict)
     transforms: list[BagPose] = field(default_factory=list)
     others: dict[str, str] = field(default_factory=dict)
-    """Schema of the topics that are not read."""
+    """Schemas of the topics that are not read."""
 
     @property
     def topics(self) -> list[str]:
-        """Names of all topics but transforms."""
+        """Names of all topics except transforms."""
         return sorted({*self.scans, *self.odometry, *self.others})
 
 
 @dataclass(frozen=True, slots=True)
 class RawMessage:
-    """One message, not decoded yet."""
+    """Encoded message."""
 
     topic: str
     schema: str
@@ -89,14 +89,14 @@ class RawMessage:
     logged: int
     data: bytes
     definition: bytes = b""
-    """Text of the schema, if the log holds one."""
+    """Text of the schema, if the log contains one."""
 
 
 def homogeneous(translation: Any, rotation: Any) -> Array:
-    """Matrix (4, 4) of a vector and a quaternion with components x, y, z, w.
+    """Return the matrix (4, 4) of a translation and a quaternion, each with components x, y, z (and w).
 
     Raises:
-        ValueError: the quaternion is zero, or something is not finite.
+        ValueError: the quaternion is zero, or a component is not finite.
     """
     x, y, z, w = rotation.x, rotation.y, rotation.z, rotation.w
     length = math.sqrt(x * x + y * y + z * z + w * w)
@@ -124,11 +124,11 @@ def content_of(path: Path, messages: Iterator[RawMessage]) -> BagContent:
     """Decode scans, odometry and transforms.
 
     Args:
-        path: the log, for refusals.
+        path: path of the log, for error messages.
         messages: messages of the log, in any order.
 
     Raises:
-        InputError: a message of these is damaged; names the topic.
+        InputError: one of these messages is damaged; the text names the topic.
     """
     content = BagContent()
     for raw in messages:
@@ -164,7 +164,7 @@ def _ros(encoding: str) -> Callable[[str, bytes], Any]:
 
 @cache
 def _ros_types() -> tuple[Any, Any]:
-    """Layouts of messages of ROS 1 and 2: the same in all versions, so the definitions in a bag are not needed."""
+    """Return the type stores of ROS 1 and 2, whose layouts are the same in all versions: a bag's own are not needed."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: PLC0415 - comes with an extra
 
     ros1 = get_typestore(Stores.ROS1_NOETIC)
@@ -185,14 +185,14 @@ def _ros_time(stamp: Any) -> int:
 
 
 def _foxglove_time(stamp: Any) -> int:
-    """Time of a protobuf timestamp, or of its JSON form."""
+    """Return the time of a protobuf timestamp or of its JSON form (ns)."""
     if hasattr(stamp, "seconds"):
         return int(stamp.seconds) * SECOND + int(stamp.nanos)
     return int(stamp.sec) * SECOND + int(stamp.nsec)
 
 
 def _frame(name: str) -> str:
-    """Name of a frame; names of tf began with a slash."""
+    """Return a frame name without the leading slash that early tf used."""
     return name.removeprefix("/")
 
 
@@ -226,10 +226,10 @@ def _foxglove_scan(content: BagContent, raw: RawMessage, message: Any) -> None:
 
 
 def _checked(scan: BagScan) -> BagScan:
-    """The same scan.
+    """Return the scan after a check.
 
     Raises:
-        ValueError: its angles, times or limits are not numbers, or all its beams have one angle.
+        ValueError: its angles, times or limits are not numbers, or all its beams have the same angle.
     """
     numbers = scan.start_angle, scan.angle_increment, scan.time_increment, *(scan.limits or ())[:1]
     if not all(map(math.isfinite, numbers)) or scan.angle_increment == 0:

@@ -32,7 +32,7 @@ class _LaserLine:
     robot: Pose2
     time: float
     logged: float
-    """Time of the logger (s); infinite where the line has none."""
+    """Time of the logger (s); infinite if the line has none."""
     laser: Pose2 | None = None
     geometry: tuple[tuple[str, float], ...] = ()
 
@@ -41,12 +41,12 @@ def read_carmen(path: Path, given: dict[str, Any], topics: tuple[str, ...] = ())
     """Read the scans of a CARMEN log with raw odometry.
 
     Args:
-        path: text, or text packed by gzip (``.gz``).
-        given: geometry, overrides the log.
-        topics: the kind of line to read; empty: the one with the most scans.
+        path: text file, or gzip-compressed text (``.gz``).
+        given: geometry; overrides the log.
+        topics: kind of line to read; empty: the one with the most scans.
 
     Raises:
-        InputError: it is damaged, or all scans have one time.
+        InputError: the log is damaged, or all scans have the same time.
     """
     found: dict[str, list[_LaserLine]] = {kind: [] for kind in KINDS}
     for number, line in enumerate(lines_of(path, "a log with scans (MCAP, bag, npz or text)"), start=1):
@@ -99,7 +99,7 @@ def _robotlaser(words: list[str]) -> _LaserLine:
 
 
 def _count(words: list[str], at: int) -> int:
-    """Number of the values that follow word ``at``."""
+    """Return the number of values that follow word ``at``."""
     count = int(words[at])
     if not 0 <= count <= len(words) - at - 1:
         raise ValueError(f"{count} values")
@@ -107,7 +107,7 @@ def _count(words: list[str], at: int) -> int:
 
 
 def _times(words: list[str]) -> tuple[float, float]:
-    """Time of the message and of the logger (s)."""
+    """Return the times of the message and of the logger (s)."""
     time, logged = float(words[0]), float(words[2]) if len(words) > 2 else math.inf
     if not math.isfinite(time):
         raise ValueError(f"time {time}")
@@ -115,13 +115,13 @@ def _times(words: list[str]) -> tuple[float, float]:
 
 
 def _clocks(lines: list[_LaserLine]) -> list[Array]:
-    """The clocks, each with one time per line."""
+    """Return the clocks, each with one time per line."""
     clocks = np.array([(line.time, line.logged) for line in lines]).T
     return [times for times in clocks if np.isfinite(times).all()]
 
 
 def _mount(lines: list[_LaserLine]) -> Pose2 | None:
-    """Pose of the laser in the robot; None where the lines hold none, or one that changes."""
+    """Return the pose of the laser in the robot; None if the lines have none, or a changing one."""
     pairs = [(line.robot, line.laser) for line in lines if line.laser is not None]
     if not pairs:
         return None
@@ -130,5 +130,5 @@ def _mount(lines: list[_LaserLine]) -> Pose2 | None:
     off = mounts - mounts[0]
     off[:, 2] = wrap(off[:, 2])
     middle = np.median(off, axis=0)
-    steady_mount = 0.01  # poses of laser and robot in one line tell the mount if it stays the same to this, m and rad
+    steady_mount = 0.01  # maximum change of the laser's pose relative to the robot for a fixed mount (m and rad)
     return vector(mounts[0] + middle) if np.abs(off - middle).max() < steady_mount else None

@@ -1,4 +1,4 @@
-"""Columns of a table of any length: values wait in one file without a name, and become arrays chunk by chunk."""
+"""Columns of a table of any length: values are collected in an unnamed file and become arrays chunk by chunk."""
 
 import pickle
 import zipfile
@@ -17,10 +17,10 @@ KEPT_BYTES: Final = 16_000_000
 
 
 class Spool:
-    """Values of many columns.
+    """Storage for the values of many columns.
 
     Args:
-        file: open for reading and writing, and inaccessible to others: its content is trusted.
+        file: file open for reading and writing, inaccessible to others, because its content is trusted.
     """
 
     def __init__(self, file: IO[bytes]) -> None:
@@ -29,13 +29,13 @@ class Spool:
         self._size = 0
 
     def column(self, text: Callable[[Any], str]) -> "Column":
-        """A new column; ``text`` converts values that are neither array nor number."""
+        """Create a column; ``text`` converts values that are neither array nor number."""
         made = Column(self, text)
         self._columns.append(made)
         return made
 
     def grow(self, size: int) -> None:
-        """A column has so many bytes more in memory; beyond ``KEPT_BYTES`` all go to the file."""
+        """Add to the bytes in memory; beyond ``KEPT_BYTES`` all columns are moved to the file."""
         self._size += size
         if self._size > KEPT_BYTES:
             for column in self._columns:
@@ -43,13 +43,13 @@ class Spool:
             self._size = 0
 
     def write(self, values: list[Any]) -> int:
-        """Keep a chunk; returns where."""
+        """Write a chunk; return its offset."""
         place = self._file.seek(0, 2)
         pickle.dump(values, self._file, pickle.HIGHEST_PROTOCOL)
         return place
 
     def read(self, place: int) -> list[Any]:
-        """A chunk."""
+        """Read a chunk."""
         self._file.seek(place)
         values: list[Any] = pickle.load(self._file)  # noqa: S301  # of this process alone
         return values
@@ -59,7 +59,7 @@ class Column:
     """Values of one column.
 
     Args:
-        spool: keeps them.
+        spool: storage of the values.
         text: converts values that are neither array nor number.
     """
 
@@ -76,7 +76,7 @@ class Column:
         self._count = 0
 
     def add(self, value: Any) -> None:
-        """Add one: an array, a number, None, or what text is made of."""
+        """Add a value: an array, a number, None, or an object that ``text`` converts."""
         self._count += 1
         # Bytes of a value that is neither array nor text.
         size = 64
@@ -97,7 +97,7 @@ class Column:
         self._spool.grow(size)
 
     def flush(self) -> None:
-        """Move waiting values to the file."""
+        """Move pending values to the file."""
         if self._waiting:
             self._places.append(self._spool.write(self._waiting))
             self._waiting = []
@@ -107,7 +107,7 @@ class Column:
         return map(self._spool.read, self._places)
 
     def write(self, archive: zipfile.ZipFile, name: str) -> None:
-        """Write it as array ``name``, and, of arrays that differ in length, ``name.lengths``.
+        """Write the column as array ``name``; for arrays of different lengths also ``name.lengths``.
 
         Raises:
             InputError: a number has more than 64 bits.
@@ -122,7 +122,7 @@ class Column:
             _write(archive, name, np.dtype(f"<U{width}"), (self._count,), parts)
 
     def _texts(self) -> Iterator[list[str]]:
-        rows = 256  # texts that are an array at a time: each is as wide as the longest one
+        rows = 256  # number of texts per array: each is as wide as the longest one
         for values in self._chunks():
             for first in range(0, len(values), rows):
                 yield [v if isinstance(v, str) else self._text(v) for v in values[first : first + rows]]
@@ -152,9 +152,9 @@ def _write(
     shape: tuple[int, ...],
     parts: Iterable[NDArray[Any]],
 ) -> None:
-    """Write an array of the form that ``numpy.load`` reads, part by part.
+    """Write an array for ``numpy.load``, part by part.
 
-    numpy's own function takes no array called ``file``, which journal records have, and the whole of it at once.
+    numpy's own function needs the whole array at once, and rejects the name ``file``, which journal records use.
     """
     if dtype.hasobject:
         raise InputError(f"{name}: expected numbers of at most 64 bits")

@@ -1,7 +1,7 @@
-"""Export of logs: CSV for spreadsheets, NPZ for numpy, MCAP with the stamps inside its messages in UNIX time as well.
+"""Export of logs: CSV for spreadsheets, NPZ for numpy, and MCAP with all stamps in UNIX time.
 
-In a recorded log only the log times are dates: its messages are copies from the bus. A viewer that looks up transforms
-by the stamps inside them needs log times and stamps of one clock.
+In a recorded log only the log times are UNIX times; the messages are copies from the bus, stamped in daemon time. A
+viewer that looks up transforms by message stamps needs log times and stamps of the same clock.
 """
 
 import csv
@@ -35,7 +35,7 @@ from monstertruckd.tools.logs.messages import ALL, Progress, Selection, real_off
 
 @contextmanager
 def removed_on_failure() -> Iterator[list[Path]]:
-    """Yields a list; the files and folders added to it are removed if the body fails."""
+    """Yield a list of files and folders that are removed if the body fails."""
     made: list[Path] = []
     try:
         yield made
@@ -120,7 +120,7 @@ def _write_npz(file: Path, table: Mapping[str, Column]) -> None:
 
 @contextmanager
 def whole_tables(directory: Path, suffix: str, files: dict[str, Path]) -> Iterator[Callable[[str], Path]]:
-    """Yields a function from topic to file to write; all get their final names, in ``files``, once all are complete."""
+    """Yield a function from topic to output file; all files get their final names, in ``files``, at the end."""
     with ExitStack() as whole:
 
         def place(topic: str) -> Path:
@@ -131,10 +131,10 @@ def whole_tables(directory: Path, suffix: str, files: dict[str, Path]) -> Iterat
 
 
 def made_folder(directory: str | Path) -> Path:
-    """The folder, made if need be.
+    """Return the folder; it is created if missing.
 
     Raises:
-        InputError: it cannot be made.
+        InputError: it cannot be created.
     """
     directory = Path(directory)
     try:
@@ -151,7 +151,7 @@ def _stem(topic: str) -> str:
 def _rows(
     path: str | Path | LogReader, directory: Path, selection: Selection, progress: Progress | None
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """(topic, column to value) of every selected message; pictures are saved on the way."""
+    """Yield (topic, column to value) of every selected message; pictures are saved to files."""
     reader = open_log(path)
     offset = real_offset(reader)
     for entry, message in selection.of(reader, progress):
@@ -170,7 +170,7 @@ def _save(data: bytes, directory: Path, name: str) -> str:
 
 
 def flat(record: BaseModel | None, model: type[BaseModel], prefix: str) -> dict[str, Any]:
-    """Columns of a record; the same for all messages of a model."""
+    """Return the columns of a record; they are the same for all messages of a model."""
     row: dict[str, Any] = {}
     for name, field in model.model_fields.items():
         value = None if record is None else getattr(record, name)
@@ -180,7 +180,7 @@ def flat(record: BaseModel | None, model: type[BaseModel], prefix: str) -> dict[
 
 
 def record_type(annotation: Any) -> type[BaseModel] | None:
-    """The model of a field that is a record or an optional one; None for other fields."""
+    """Return the model of a field that is a record or an optional record; None for other fields."""
     for option in (annotation, *get_args(annotation)):
         if isinstance(option, type) and issubclass(option, BaseModel) and _is_plain(annotation):
             return option
@@ -188,7 +188,7 @@ def record_type(annotation: Any) -> type[BaseModel] | None:
 
 
 def _is_plain(annotation: Any) -> bool:
-    """A record or an optional record, not a list of records."""
+    """Whether a type is a record or an optional record, not a list of records."""
     return all(option is type(None) or isinstance(option, type) for option in (get_args(annotation) or (annotation,)))
 
 
@@ -229,7 +229,7 @@ def export_mcap(
     """Write the selected messages to a new file with log times, stamps and headers in UNIX time.
 
     Returns:
-        The file by topic; it is not made if no message is selected.
+        The file by topic; it is not created if no message is selected.
 
     Raises:
         NotFoundError: no such log.

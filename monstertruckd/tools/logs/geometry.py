@@ -1,4 +1,4 @@
-"""Size of the robot whose log it is."""
+"""Geometry of the robot that recorded a log."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,14 +12,14 @@ from monstertruckd.config.truck import Geometry
 
 
 def recorded_geometry(log: Path, config: Mapping[str, Any]) -> Geometry:
-    """Geometry by the configuration attached to a log; the default where it is missing there.
+    """Return the geometry from the configuration attached to a log, or the default if it has none.
 
     Args:
-        log: named in complaints.
-        config: plain values.
+        log: path of the log, for error messages.
+        config: attached configuration as plain values.
 
     Raises:
-        InputError: this version does not take it.
+        InputError: the geometry is invalid in this version.
     """
     try:
         return Geometry.model_validate(config.get("geometry", {}), strict=False)

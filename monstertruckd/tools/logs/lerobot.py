@@ -38,7 +38,7 @@ ACTIONS: Final = {t.CMD_DRIVE.name: ("speed",), t.CMD_STEERING.name: ("front", "
 CAMERA: Final = "observation.images.camera"
 TASK: Final = "drive"
 ROWS: Final = 1024
-"""Frames of a row group."""
+"""Number of frames in a row group."""
 _FILE: Final = "chunk-000/file-000"
 _INDICES: Final = ("frame_index", "episode_index", "index", "task_index")
 
@@ -187,7 +187,7 @@ def _action(newest: Mapping[str, Message]) -> list[float]:
 
 
 def _made(file: Path) -> Path:
-    """Make the file's folder and return the file."""
+    """Create the file's folder and return the file."""
     file.parent.mkdir(parents=True, exist_ok=True)
     return file
 

@@ -1,4 +1,4 @@
-"""A running robot in the rerun viewer, drawn like its log. A program of ``live_process``.
+"""Draws a running robot in the rerun viewer, like its log. Started by ``live_process``.
 
     python -m monstertruckd.tools.logs.live ROBOT ENDPOINT VIEWER
 
@@ -36,12 +36,12 @@ async def follow(robot: str, endpoint: str, clock: Clock, stream: rr.RecordingSt
     topics = {topic.name: topic for topic in drawn}
     scene = Scene(stream, clock.real_offset())
     laid_out: set[str] = set()
-    retry = 1.0  # seconds between two attempts to reach the robot, and time limit of its answer
+    retry = 1.0  # interval between connection attempts to the robot, and timeout of its answer (s)
     while True:
         with suppress(TruckError):
             async with TruckClient(robot, endpoint, clock=clock, timeout=retry) as client:
                 with ExitStack() as stack:
-                    waiting = 200  # messages of a topic that may wait for a look
+                    waiting = 200  # maximum number of waiting messages of a topic
                     boxes = [
                         (topic, stack.enter_context(client.subscribe(topic, fifo(waiting))))
                         for topic in topics.values()
@@ -52,12 +52,12 @@ async def follow(robot: str, endpoint: str, clock: Clock, stream: rr.RecordingSt
                         if scene.entities != laid_out:
                             laid_out = set(scene.entities)
                             stream.send_blueprint(blueprint(laid_out))
-                        await clock.sleep(0.1)  # seconds between two checks of what came
+                        await clock.sleep(0.1)  # seconds between two checks for messages
         await clock.sleep(retry)
 
 
 def take(scene: Scene, boxes: list[tuple[Topic[Any], Mailbox[Any]]]) -> None:
-    """Draw all messages that wait, in the order of their stamps."""
+    """Draw all waiting messages in the order of their stamps."""
     waiting: list[tuple[Message, str]] = [(message, topic.name) for topic, box in boxes for message in box.drain()]
     for message, topic in sorted(waiting, key=lambda row: row[0].received):
         scene.take(topic, message.received, message)
@@ -65,9 +65,9 @@ def take(scene: Scene, boxes: list[tuple[Topic[Any], Mailbox[Any]]]) -> None:
 
 
 def main() -> None:
-    """Draw until standard input ends; a robot that is not there is waited for."""
+    """Draw until standard input ends; wait for a robot that is absent."""
     robot, endpoint, viewer = sys.argv[1:]
-    # Drawing stands still where the viewer takes nothing, so that a thread has to see the end.
+    # Drawing blocks while the viewer accepts nothing, so a thread has to detect the end of the input.
     threading.Thread(target=_end_with_input, daemon=True).start()
     stream = rr.RecordingStream(APPLICATION)
     stream.connect_grpc(viewer)

@@ -1,7 +1,7 @@
 """A running robot in the rerun viewer, drawn by a separate process.
 
-The SDK keeps messages that a viewer does not take, and blocks when they are too many: in the station's process it would
-block the page, too. The process runs only while a viewer listens.
+The SDK buffers messages that the viewer does not read, and blocks when the buffer is full. In the station's process it
+would block the page as well. The process runs only while a viewer listens.
 """
 
 import asyncio
@@ -17,7 +17,7 @@ from monstertruck_runtime.clock import Clock
 VIEWER: Final = "rerun+http://127.0.0.1:9876/proxy"
 """Address of a viewer on this machine: ``rerun --bind 127.0.0.1``."""
 LISTENER_LOOK_PERIOD: Final = 2.0
-"""Seconds between two looks whether it listens."""
+"""Interval between checks whether a viewer listens (s)."""
 PROGRAM: Final = (sys.executable, "-m", "monstertruckd.tools.logs.live")
 
 
@@ -27,8 +27,8 @@ async def show_live(
     """Show a robot until cancelled, in a viewer whenever there is one.
 
     Args:
-        robot: its name.
-        endpoint: where it listens.
+        robot: name of the robot.
+        endpoint: endpoint of the robot.
         clock: time.
         viewer: address of the rerun viewer.
         program: program that draws, given robot, endpoint and viewer.
@@ -36,7 +36,7 @@ async def show_live(
     while True:
         while not await listens(viewer):
             await clock.sleep(LISTENER_LOOK_PERIOD)
-        # A separate session: Ctrl-C is for the station, which ends it.
+        # A separate session: Ctrl-C goes to the station, which ends this process.
         drawing = await asyncio.create_subprocess_exec(
             *program, robot, endpoint, viewer, stdin=PIPE, stdout=DEVNULL, start_new_session=True
         )

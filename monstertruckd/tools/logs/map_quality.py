@@ -22,16 +22,16 @@ REJECTED = "rejected"
 
 @dataclass(frozen=True, slots=True)
 class PathQuality:
-    """Path of a finished map, and how much of it is lost."""
+    """Path of a finished map, and the fraction that is lost."""
 
     lost: NDArray[np.bool_]
     """Shape (n,): which poses of the trajectory are lost."""
     length: float
     """Length of the path (m)."""
     lost_share: float
-    """Share of it that is lost, 0..1."""
+    """Fraction of the path that is lost, 0..1."""
     odometry: dict[str, float]
-    """Share of the path between used scans by ``OdometryUse``, 0..1."""
+    """Fraction of the path between used scans by ``OdometryUse``, 0..1."""
 
     @classmethod
     def of(
@@ -41,16 +41,16 @@ class PathQuality:
         estimates: Iterable[SlamEstimate],
         scans: Sequence[ScanInput],
     ) -> Self:
-        """Judge a path.
+        """Evaluate a path.
 
-        A pose is lost if its scan belongs to a submap that is not joined to the map, or fitted nothing while the robot
-        was lost. The later of two poses decides about the path between them. The distance by odometry after the
-        last used scan is lost, too.
+        A pose is lost if its scan belongs to a submap that is not joined to the map, or matched nothing while the robot
+        was lost. The path between two poses is lost if the later one is. The odometry distance after the last used scan
+        is lost as well.
 
         Args:
             trajectory: stamps (n,), ns, and poses (n, 3) of base in map.
-            on_map: shape (n,), which of them belong to the map.
-            estimates: estimates of the scans, as they were made.
+            on_map: shape (n,), whether each pose belongs to the map.
+            estimates: estimates of the scans, in the order of processing.
             scans: all scans of the log.
         """
         stamps, poses = trajectory
@@ -72,7 +72,7 @@ class PathQuality:
 
 
 def verdicts(estimates: Iterable[SlamEstimate]) -> dict[str, int]:
-    """Rejected matches by verdict, the most frequent first."""
+    """Count the rejected matches by verdict, the most frequent first."""
     return dict(Counter(one.verdict for one in estimates if REJECTED in one.events).most_common())
 
 
@@ -81,7 +81,7 @@ def _misfit(estimate: SlamEstimate) -> bool:
 
 
 def _after(scans: Sequence[ScanInput], made: dict[int, SlamEstimate]) -> float:
-    """Distance by odometry from the first scan with the last stamp that was used to the end of the log (m)."""
+    """Return the odometry distance from the last used scan to the end of the log (m)."""
     last = max(made)
     rest = itertools.dropwhile(lambda scan: scan.stamp != last, scans)
     places = [scan.odom[:2] for scan in rest if scan.odom is not None]

@@ -1,7 +1,7 @@
-"""Messages of a log for the tools: which ones, decoded, and their real time.
+"""Selection of a log's messages for the tools, decoded and with their real time.
 
-The tools count in the daemon's monotonic time, because a robot without a real-time clock learns the date late and its
-clock then jumps by hours. The latest offset in a log dates all of its messages.
+The tools use the daemon's monotonic time, because a robot without a real-time clock receives the date late, and its
+clock then jumps by hours. The latest offset in a log gives the real time of all its messages.
 """
 
 import math
@@ -23,14 +23,14 @@ from monstertruckd.recorder.frames import DAMAGE, index_is_sound
 from monstertruckd.recorder.reader import LogMessage, LogReader
 
 Progress = Callable[[float], None]
-"""Called with the bytes of the log read so far."""
+"""Called with the number of log bytes read so far."""
 
 
 def require_topics(*names: str) -> None:
-    """Refuse names that are not in the table of topics.
+    """Check that all names are in the topic table.
 
     Raises:
-        NotFoundError: one is not; names those that are like it.
+        NotFoundError: a name is unknown; the text suggests similar ones.
     """
     for name in sorted(set(names) - BY_NAME.keys()):
         close = [topic for topic in BY_NAME if name in topic.split("/")] or get_close_matches(name, BY_NAME)
@@ -40,12 +40,12 @@ def require_topics(*names: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """A choice of a log's messages; by default all of the topics in the table.
+    """Selection of a log's messages; by default all messages of known topics.
 
     Args:
-        topics: names; empty: all.
-        start: seconds after the log's first message.
-        end: as ``start``, not included.
+        topics: topic names; empty: all.
+        start: start time after the log's first message (s).
+        end: end time after the log's first message (s), exclusive.
 
     Raises:
         NotFoundError: a topic is not in the table.
@@ -63,15 +63,15 @@ class Selection:
 
     @property
     def nothing(self) -> str:
-        """Remark about a log without a selected message."""
+        """Message for a log without a selected message."""
         every = not self.topics and self.start == 0.0 and self.end == math.inf
         return "no message of a topic known to this version" if every else "no message of these topics and times"
 
     def of(self, reader: LogReader, progress: Progress | None = None) -> Iterator[tuple[LogMessage, Message]]:
-        """The selected messages with their decoded forms; other schemas are skipped.
+        """Yield the selected messages with their decoded forms; other schemas are skipped.
 
         Raises:
-            InputError: a selected message is invalid; names file, message and field.
+            InputError: a selected message is invalid; the text names file, message and field.
         """
         first: int | None = None
         for number, entry in enumerate(reader, start=1):
@@ -95,10 +95,10 @@ ALL = Selection()
 
 
 def real_offset(reader: LogReader) -> int:
-    """Real (UNIX) minus daemon time, ns, by the latest message about it in the log; 0 without one.
+    """Return real (UNIX) minus daemon time (ns) from the log's latest clock message; 0 without one.
 
     Raises:
-        InputError: the log's metadata of it is not a number.
+        InputError: the offset in the log's metadata is not a number.
     """
     newest = _newest_clock(reader)
     if newest is not None:
@@ -107,7 +107,7 @@ def real_offset(reader: LogReader) -> int:
 
 
 def first_offset(log: Path, metadata: Mapping[str, str]) -> int:
-    """Real minus daemon time, ns, at the start of a run, by its metadata; 0 without.
+    """Return real minus daemon time (ns) at the start of a run, from its metadata; 0 without it.
 
     Raises:
         InputError: the metadata is not a number.
@@ -120,7 +120,7 @@ def first_offset(log: Path, metadata: Mapping[str, str]) -> int:
 
 
 def _newest_clock(reader: LogReader) -> bytes | None:
-    """Payload of the last clock message: by the index, or, without a valid one, by reading the whole log."""
+    """Return the payload of the last clock message, by the index or, if that is invalid, by reading the whole log."""
     with reader.path.open("rb") as file, suppress(*DAMAGE):
         sound = index_is_sound(file)
         file.seek(0)
@@ -135,5 +135,5 @@ def _newest_clock(reader: LogReader) -> bytes | None:
 
 
 def utc(real: int) -> str:
-    """A real time, ns, as ``YYYY-MM-DD hh:mm:ss`` UTC."""
+    """Format a real time (ns) as ``YYYY-MM-DD hh:mm:ss`` UTC."""
     return str(np.datetime64(real // SECOND, "s")).replace("T", " ")

@@ -1,7 +1,7 @@
-"""A log for a notebook: topics as NumPy arrays, pandas or polars tables, pictures, maps and events.
+"""Log access for notebooks: topics as NumPy arrays, pandas or polars tables, pictures, maps and events.
 
-Every read passes the file once, in bounded memory: only the selected data remains, so choose columns of long logs,
-or go through ``batches`` or ``frames``.
+Every call reads the file once and keeps only the selected data in memory. For long logs, select columns, or iterate
+with ``batches`` or ``frames``.
 """
 
 import warnings
@@ -35,11 +35,10 @@ Library = Literal["pandas", "polars"]
 
 
 class OpenedLog:
-    """A log opened for analysis, finished or not; damage is a warning, and intact parts are read.
+    """A log opened for analysis, finished or not; damage causes a warning, and the intact parts are read.
 
-    Give topics in full (``state/odometry``) or by their last part where only one topic besides ``health/`` has it
-    (``odometry``).
-    ``start`` and ``end`` of its methods are seconds after the log's first message.
+    Topics may be given in full (``state/odometry``) or by their last part (``odometry``) if it is unique outside
+    ``health/``. ``start`` and ``end`` of its methods are seconds after the log's first message.
 
     Args:
         path: an MCAP file of this program.
@@ -56,15 +55,15 @@ class OpenedLog:
         return f"<log {self._reader.path}>"
 
     def topics(self) -> dict[str, int]:
-        """Messages by topic."""
+        """Number of messages by topic."""
         return {name: row["messages"] for name, row in info(self._reader.path)["topics"].items()}
 
     def config(self) -> dict[str, Any]:
-        """The robot's configuration as it was recorded; empty where there is none."""
+        """Recorded configuration of the robot; empty if there is none."""
         return self._reader.config()
 
     def messages(self, topic: str, start: float = 0.0, end: float = np.inf) -> Iterator[tuple[float, Message]]:
-        """Time (s) and message of a topic."""
+        """Yield time (s) and message of a topic."""
         first = self._first()
         for entry, message in Selection((named(topic),), start, end).of(self._reader):
             yield (entry.log_time - first) / SECOND, message
@@ -73,13 +72,13 @@ class OpenedLog:
     def batches(
         self, topic: str, columns: Sequence[str] = (), start: float = 0.0, end: float = np.inf
     ) -> Iterator[pa.RecordBatch]:
-        """A topic's rows as Arrow batches of a few MB: a log of any length passes through little memory."""
+        """Yield a topic's rows as Arrow batches of a few MB, so that a log of any length needs little memory."""
         for _, batch in arrow.batches(self._reader, Selection((named(topic),), start, end), columns):
             yield batch
         self._warn()
 
     def table(self, topic: str, columns: Sequence[str] = (), start: float = 0.0, end: float = np.inf) -> pa.Table:
-        """A topic as an Arrow table, with ``time``, s since the log's first message, as the first column.
+        """Return a topic as an Arrow table whose first column is ``time`` (s since the log's first message).
 
         Raises:
             NotFoundError: no such topic or column.
@@ -90,19 +89,19 @@ class OpenedLog:
     def numpy(
         self, topic: str, columns: Sequence[str] = (), start: float = 0.0, end: float = np.inf
     ) -> dict[str, NDArray[Any]]:
-        """A topic as one array per column, shape (messages,) or (messages, length); absent numbers are NaN.
+        """Return a topic as one array per column, shape (messages,) or (messages, length); absent numbers are NaN.
 
-        Arrays that differ in length are an object array of arrays.
+        Arrays of different lengths become an object array of arrays.
         """
         table = self.table(topic, columns, start, end)
         return {name: _as_numpy(table[name].combine_chunks()) for name in table.column_names}
 
     def pandas(self, topic: str, columns: Sequence[str] = (), start: float = 0.0, end: float = np.inf) -> Any:
-        """A topic as a ``pandas.DataFrame`` with ``time`` (s since the log's first message) as its index."""
+        """Return a topic as a ``pandas.DataFrame`` with ``time`` (s since the log's first message) as its index."""
         return _as_frame(self.table(topic, columns, start, end), "pandas")
 
     def polars(self, topic: str, columns: Sequence[str] = (), start: float = 0.0, end: float = np.inf) -> Any:
-        """A topic as a ``polars.DataFrame``."""
+        """Return a topic as a ``polars.DataFrame``."""
         return _as_frame(self.table(topic, columns, start, end), "polars")
 
     def frame(
@@ -115,18 +114,18 @@ class OpenedLog:
         end: float = np.inf,
         library: Library = "pandas",
     ) -> Any:
-        """Several topics in one table: a row per message of ``at``, with the messages nearest by their stamps.
+        """Join several topics in one table: a row per message of ``at``, with the nearest messages by stamp.
 
-        Columns carry the topic's name as it is given here: ``odometry.pose.x``.
+        Column names start with the topic as given here: ``odometry.pose.x``.
 
         Args:
-            topics: names.
-            at: the topic whose messages make the rows; by default the first.
-            within: greatest difference of two stamps (s); without a message so near, the row's other cells are empty.
-            columns: names as they are in each topic's table, for those topics that have them; empty: all.
-            start: s after the log's first message.
-            end: as ``start``.
-            library: library of the table.
+            topics: topic names.
+            at: topic whose messages define the rows; by default the first.
+            within: maximum difference of two stamps (s); without a message within it, the topic's cells are empty.
+            columns: column names in the topics' tables; empty: all.
+            start: start time after the log's first message (s).
+            end: end time after the log's first message (s).
+            library: library of the returned table.
 
         Raises:
             InputError: no topic, or ``at`` is not among them.
@@ -146,9 +145,9 @@ class OpenedLog:
         library: Library = "pandas",
         seconds: float = 60.0,
     ) -> Iterator[Any]:
-        """The table of ``frame`` in parts of about ``seconds`` of the log: any length passes through bounded memory.
+        """Yield the table of ``frame`` in parts of about ``seconds`` of the log, in bounded memory.
 
-        A row waits for a later message of each topic, for ``seconds`` at most.
+        A row waits at most ``seconds`` for a later message of each topic.
         """
         for table in self._aligned(topics, at, within, columns, Selection((), start, end), seconds):
             if len(table):
@@ -163,7 +162,7 @@ class OpenedLog:
         times: Selection,
         seconds: float,
     ) -> Iterator[pa.Table]:
-        """Tables as ``frame`` describes them, one for each window of ``seconds``."""
+        """Yield the tables of ``frame``, one for each window of ``seconds``."""
         at = topics[0] if at is None and topics else at
         if at is None or at not in topics:
             raise InputError(f"at {at!r}: expected one of the topics of the table ({', '.join(topics) or 'none'})")
@@ -175,7 +174,7 @@ class OpenedLog:
         selection, first = Selection(tuple(wanted), times.start, times.end), self._first()
 
         def beside(rows: pa.Table, tables: Mapping[str, pa.Table]) -> pa.Table:
-            """The other topics' rows matched to ``at``."""
+            """Match the rows of the other topics to the rows of ``at``."""
             stamps = rows[STAMP].to_numpy()
             parts = {TIME: pa.array((rows[LOG_TIME].to_numpy() - first) / SECOND)}
             for topic, table in tables.items():
@@ -199,7 +198,7 @@ class OpenedLog:
     def images(
         self, topic: str = t.CAMERA.name, start: float = 0.0, end: float = np.inf
     ) -> Iterator[tuple[float, NDArray[np.uint8]]]:
-        """Time (s) and picture, shape (height, width, 3), RGB, one at a time.
+        """Yield time (s) and picture, shape (height, width, 3), RGB.
 
         Raises:
             InputError: a picture is damaged or has too many pixels.
@@ -211,17 +210,17 @@ class OpenedLog:
             yield time, pixels_of(data, where)
 
     def maps(self, start: float = 0.0, end: float = np.inf) -> Iterator[tuple[float, Grid, NDArray[np.int8]]]:
-        """Time (s), map and its cells, shape (height, width), row 0 at the lowest y."""
+        """Yield time (s), map and its cells, shape (height, width), row 0 at the lowest y."""
         for time, message in self.messages(t.MAP.name, start, end):
             if isinstance(message, Grid):
                 yield time, message, message.cells.reshape(message.height, message.width)
 
     def events(self, start: float = 0.0, end: float = np.inf) -> Any:
-        """Decisions, faults and recoveries as a ``pandas.DataFrame``."""
+        """Return decisions, faults and recoveries as a ``pandas.DataFrame``."""
         return self.pandas(t.EVENT.name, start=start, end=end)
 
     def _first(self) -> int:
-        """Daemon time of the first message (ns); 0 of an empty log."""
+        """Return the daemon time of the first message (ns); 0 for an empty log."""
         return next((entry.log_time for entry in self._reader), 0)
 
     def _table(self, topic: str, columns: Sequence[str], start: float, end: float) -> pa.Table:
@@ -241,15 +240,15 @@ class OpenedLog:
 
 
 def named(topic: str) -> str:
-    """A topic's full name, from that or from its last part.
+    """Return a topic's full name, given the full name or its last part.
 
     Raises:
-        NotFoundError: no topic, or several topics, have it.
+        NotFoundError: no topic, or more than one, has this name.
     """
     if topic in BY_NAME:
         return topic
     found = [name for name in BY_NAME if name.rpartition("/")[2] == topic]
-    # A service, a request and an output may share a name: the output is meant.
+    # A service, a request and an output may share a name: the output is used.
     found = [name for name in found if not name.startswith(("health/", "req/"))] or found
     if len(found) > 1:
         raise NotFoundError(f"topic {topic}: expected one of {', '.join(found)}")
@@ -259,13 +258,13 @@ def named(topic: str) -> str:
 
 
 def _wanted(names: Sequence[str], columns: Sequence[str]) -> list[str]:
-    """Those columns of a topic that a table needs; empty: all."""
+    """Return the columns of a topic that a table needs; empty: all."""
     times = (LOG_TIME, STAMP)
     return [*times, *(name for name in names if name in columns and name not in times)] if columns else []
 
 
 def _ready(tables: Mapping[str, pa.Table], at: str, seconds: float) -> pa.Array:
-    """Which rows of ``at`` have a later one of every other topic, or have waited for ``seconds`` of the log."""
+    """Return which rows of ``at`` have a later row of every other topic, or have waited for ``seconds`` of the log."""
     rows = tables[at]
     newest = min((_greatest(table[STAMP]) for topic, table in tables.items() if topic != at), default=np.inf)
     waited = max(_greatest(table[LOG_TIME]) for table in tables.values()) - seconds * SECOND
@@ -273,7 +272,7 @@ def _ready(tables: Mapping[str, pa.Table], at: str, seconds: float) -> pa.Array:
 
 
 def _rest(tables: Mapping[str, pa.Table], at: str, ready: pa.Array, seconds: float) -> dict[str, pa.Table]:
-    """Waiting rows of ``at``, and rows of other topics that may be nearest to them or to later ones."""
+    """Return the waiting rows of ``at``, and the rows of other topics that may be nearest to them or to later ones."""
     waiting = tables[at].filter(pc.invert(ready))
     since = max(_greatest(table[STAMP]) for table in tables.values()) - seconds * SECOND
     if len(waiting):
@@ -287,17 +286,17 @@ def _rest(tables: Mapping[str, pa.Table], at: str, ready: pa.Array, seconds: flo
 
 
 def _greatest(values: Any) -> float:
-    """The greatest of whole numbers, or minus infinity of none."""
+    """Return the maximum of integers, or minus infinity if there are none."""
     return np.asarray(values).max() if len(values) else -np.inf
 
 
 def _nearest(stamps: NDArray[np.int64], at: NDArray[np.int64], within: float) -> pa.Array:
-    """For each time the index of the nearest stamp, null where none is within ``within`` s.
+    """Return for each time the index of the nearest stamp; null if none is within ``within`` seconds.
 
     Args:
         stamps: shape (n,), ns, in any order.
-        at: shape (m,) (ns).
-        within: s.
+        at: times, shape (m,) (ns).
+        within: maximum difference (s).
     """
     if not len(stamps):
         return pa.nulls(len(at), pa.int64())

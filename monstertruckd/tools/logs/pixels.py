@@ -1,4 +1,4 @@
-"""Recorded pictures as arrays."""
+"""Decoding of recorded pictures to arrays."""
 
 from io import BytesIO
 from pathlib import Path
@@ -15,10 +15,10 @@ def pixels_of(data: bytes, where: str) -> NDArray[np.uint8]:
 
     Args:
         data: the file.
-        where: it is from, for the refusal.
+        where: origin of the picture, for error messages.
 
     Raises:
-        InputError: it is damaged or has too many pixels.
+        InputError: the picture is damaged or has too many pixels.
     """
     with reading(Path(where), "a picture"), Image.open(BytesIO(data), formats=["JPEG"]) as image:
         require_pixels(where, image.width, image.height)

@@ -1,4 +1,4 @@
-"""Poses of a log as text of the TUM and KITTI benchmarks, a file per topic of poses."""
+"""Poses of a log in the text formats of the TUM and KITTI benchmarks, one file per topic."""
 
 from contextlib import ExitStack
 from pathlib import Path
@@ -33,7 +33,7 @@ def export_kitti(
 ) -> dict[str, Path]:
     """Write ``<group>_<name>.kitti`` for every topic of poses: the 3 x 4 matrix of base in its frame, row by row.
 
-    Returns, raises: as ``export_tum``.
+    Returns and raises the same as ``export_tum``.
     """
     return _export(path, output, selection, progress, ".kitti", kitti)
 

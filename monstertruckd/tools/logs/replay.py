@@ -1,4 +1,4 @@
-"""Plays a log back on Zenoh, on the log's own clock."""
+"""Replay of a log on Zenoh, on the log's own clock."""
 
 import asyncio
 from collections.abc import Callable, Collection
@@ -27,16 +27,16 @@ def replay_log(
     topics: Collection[str] | None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> int:
-    """Publish the messages of ``log`` at their own times; returns how many.
+    """Publish the messages of ``log`` at their own times; return their number.
 
-    Requests are left out: they were sent to the daemon, not by it.
+    Requests are omitted, because they were sent to the daemon, not by it.
 
     Args:
-        log: file to read; messages of other schemas are left out.
+        log: file to read; messages of other schemas are skipped.
         robot: name to publish under.
-        endpoint: where to listen.
+        endpoint: endpoint to listen on.
         speed: multiple of real time.
-        topics: only these; none = all.
+        topics: topics to publish; None: all.
         progress: called with the bytes of the log read so far.
 
     Raises:
@@ -83,10 +83,10 @@ def replay_log(
 
 
 def _rpc(clock: ReplayClock, reader: LogReader) -> Rpc:
-    """Answers to a station's calls: configuration and versions, as attached to the log."""
+    """Answer a station's calls with the configuration and versions attached to the log."""
     rpc = Rpc(clock)
     attached = {"config": reader.config()}
-    with suppress(InputError, ConfigError):  # nothing but people reads them
+    with suppress(InputError, ConfigError):  # only people read them
         attached["versions"] = attached_values(reader.path, reader.attachments(), "versions.json") or {}
     for name, value in attached.items():
         if value:

@@ -39,12 +39,12 @@ from monstertruckd.tools.logs.messages import ALL, Progress, Selection, real_off
 from monstertruckd.tools.logs.report.signals import FIGURES, Curve, DrivenPath, Figure
 
 TIMELINE: Final = "time"
-"""Real time if the log has it, else daemon time."""
+"""Real time if the log has it, otherwise daemon time."""
 APPLICATION: Final = "monstertruckd"
 
 _CAMERA: Final = "camera"
 _FIRST: Final = ("Speed", "Steering commanded", "Cross-track error", "Battery", "Lateness of the control tick")
-"""Figures that are in view when the recording opens."""
+"""Figures visible when the recording opens."""
 _SCAN, _PATH, _WAY, _TRUCK = (39, 104, 211), (120, 130, 145), (217, 83, 44), (28, 154, 104)
 _LEVELS: Final = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
 _JOURNAL: Final = {
@@ -59,7 +59,7 @@ _JOURNAL: Final = {
 def convert(
     log: str | Path | LogReader, output: str | Path, selection: Selection = ALL, progress: Progress | None = None
 ) -> Path:
-    """Write the rerun recording ``output`` of a log, its layout included, as a whole or not at all.
+    """Write a log as the rerun recording ``output``, with its layout, atomically.
 
     Raises:
         NotFoundError: no such log.
@@ -74,7 +74,7 @@ def convert(
         with whole_file(output) as part:
             part.open("wb").close()
             _record(reader, part, offset, selection, progress)
-    except (OSError, RuntimeError) as error:  # rerun raises the latter
+    except (OSError, RuntimeError) as error:  # rerun raises RuntimeError
         why = error.strerror if isinstance(error, OSError) else error
         raise InputError(f"{output}: cannot be written: {why}") from None
     return output
@@ -98,10 +98,10 @@ def _record(reader: LogReader, output: Path, offset: int, selection: Selection, 
 
 
 class Scene:
-    """Logs message by message; curves are collected and sent as columns at the end.
+    """Sends messages to a recording; curves are collected and sent as columns at the end.
 
     Args:
-        stream: recording, open.
+        stream: open recording.
         offset: real minus daemon time (ns).
     """
 
@@ -118,7 +118,7 @@ class Scene:
         self._way_frame = "odom"
         self._states: dict[str, str] = {}
         self.entities: set[str] = set()
-        """Signals and pictures that the recording has."""
+        """Signals and pictures present in the recording."""
         self._handlers: Mapping[str, Callable[[Any], None]] = {
             t.SCAN.name: self._scan,
             t.TRANSFORMS.name: self._transforms,
@@ -135,16 +135,16 @@ class Scene:
         }
 
     def truck(self, reader: LogReader) -> None:
-        """The robot as a box sized by the log's configuration; omitted without a configuration."""
+        """Draw the robot as a box with the size in the log's configuration; nothing without a configuration."""
         with suppress(InputError, ConfigError):
             self.box(reader.config().get("geometry", {}))
 
     def box(self, geometry: Mapping[str, Any]) -> None:
-        """A box of the size in this section of a configuration, with an arrow ahead; none if it does not say."""
+        """Draw a box with the size in this section of a configuration, and an arrow ahead; nothing without a size."""
         length, width = geometry.get("length"), geometry.get("width")
         if length is None or width is None:
             return
-        height = 0.15  # height of the truck's box, m; not configured
+        height = 0.15  # height of the truck's box (m), which is not configured
         box = rr.Boxes3D(sizes=[(length, width, height)], centers=[(0.0, 0.0, height / 2)], colors=_TRUCK)
         self._stream.log("truck", rr.CoordinateFrame("base"), box, static=True)
         ahead = rr.Arrows3D(vectors=[(length, 0.0, 0.0)], origins=[(0.0, 0.0, height)], colors=_TRUCK, radii=0.012)
@@ -165,7 +165,7 @@ class Scene:
             handler(message)
 
     def flush(self) -> None:
-        """Send the curves collected since the last time."""
+        """Send the curves collected since the last call."""
         names = {entity(figure, curve): curve.label for figure in FIGURES for curve in figure.curves}
         self.entities |= self._samples.keys()
         for path, (times, values) in self._samples.items():
@@ -222,11 +222,10 @@ class Scene:
         self._stream.log("map", rr.CoordinateFrame(grid.frame), picture)
 
     def _ground(self, ground: Ground) -> None:
-        """Red as it is rough, blue as it is tilted; unknown ground is clear."""
+        """Draw the ground: red for roughness, blue for tilt; unknown ground is transparent."""
         layers = np.stack((ground.roughness, ground.tilt)).reshape(2, ground.height, ground.width)
         known = layers[0] != GROUND_UNKNOWN
-        # 0.03: roughness that is shown in full, m
-        # 0.35: range of the tilt, rad
+        # 0.03: roughness at full colour, m
         full = np.array((0.03 / ROUGHNESS_STEP, 0.35 / TILT_STEP)).reshape(2, 1, 1)
         red, blue = np.where(known, np.minimum(layers / full, 1.0) * 255.0, 0.0).astype(np.uint8)
         pixels = np.stack((red, np.zeros_like(red), blue, np.where(known, np.maximum(red, blue), 0)), axis=-1)
@@ -289,10 +288,10 @@ def _part(text: str) -> str:
 
 
 def blueprint(entities: Collection[str]) -> rrb.Blueprint:
-    """The layout: place and pictures at the left, plots at the right, states and events below.
+    """Return the layout: map and pictures on the left, plots on the right, states and events below.
 
     Args:
-        entities: signals and pictures of the recording; views of others are left out.
+        entities: signals and pictures of the recording; views without data are omitted.
     """
     eye = rrb.EyeControls3D(position=(0.0, -0.4, 6.5), look_target=(0.0, 0.0, 0.0), eye_up=(0.0, 1.0, 0.0))
     place = rrb.Spatial3DView(

@@ -1,7 +1,7 @@
-"""ROS 2 bags: standard messages where ROS has them, JSON text in ``std_msgs/String`` for everything else.
+"""ROS 2 bags: standard ROS messages where they exist, otherwise JSON text in ``std_msgs/String``.
 
-Topics keep their names (``/sensor/scan``), but for transforms (``/tf``) and pictures (``/sensor/camera/compressed``).
-Stamps are real time. Frames and units follow REP 103 and 105 already.
+Topics keep their names (``/sensor/scan``), except transforms (``/tf``) and pictures (``/sensor/camera/compressed``).
+Stamps are real time. Frames and units already follow REP 103 and 105.
 """
 
 import json
@@ -36,7 +36,7 @@ def export_ros2(
     """Write a ROS 2 bag (MCAP storage, CDR).
 
     Returns:
-        The bag by topic of the log; it is not made if no message is selected.
+        The bag by topic of the log; it is not created if no message is selected.
 
     Raises:
         NotFoundError: no such log.
@@ -74,7 +74,7 @@ def export_ros2(
 
 
 def _qos(topic: Topic[Any]) -> Qos:
-    """Retained topics reach late subscribers of a replay too."""
+    """Return the quality of service: late subscribers of a replay receive retained topics as well."""
     durability = QosDurability.TRANSIENT_LOCAL if topic.retained else QosDurability.VOLATILE
     liveliness = QosLiveliness.AUTOMATIC
     depth = 1 if topic.retained else 10
@@ -84,7 +84,7 @@ def _qos(topic: Topic[Any]) -> Qos:
 
 
 def _text(message: Message, names: RosNames) -> RosValues:
-    """The message as JSON; its stamps stay daemon time, ``real_offset`` (ns) leads to the calendar."""
+    """Return the message as JSON; its stamps stay daemon time, with ``real_offset`` (ns) to convert to real time."""
     values = message.model_dump(mode="json", exclude_none=True) | {"real_offset": names.offset}
     return {"data": json.dumps(values)}
 
@@ -109,4 +109,4 @@ CONVERTERS: Final[dict[Topic[Any], tuple[str, str, Converter]]] = {
     t.MAP: ("/state/map", "nav_msgs/msg/OccupancyGrid", convert.grid),
     t.PATH: ("/plan/path", "nav_msgs/msg/Path", convert.path),
 }
-"""ROS topic, interface and conversion of the topics that ROS has a message for."""
+"""ROS topic, interface and converter of the topics with a ROS message."""

@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and 2 by the package ``rosbags``, which comes with the extra ``logs``."""
+"""Bags of ROS 1 and 2, read with the package ``rosbags`` of the extra ``logs``."""
 
 import bz2
 import sqlite3
@@ -20,7 +20,7 @@ from monstertruckd.tools.logs.bags import METADATA, READERS, RawMessage, mcap_me
 
 
 def _bounded(decompressor: Any) -> Callable[[bytes], bytes]:
-    """Return a function that unpacks a chunk of at most ``MOST_UNPACKED`` bytes, by a new ``decompressor``."""
+    """Return a function that decompresses a chunk of at most ``MOST_UNPACKED`` bytes with a new ``decompressor``."""
 
     def unpack(data: bytes) -> bytes:
         unpacking = decompressor()
@@ -37,16 +37,16 @@ BOUNDED: Final[dict[Any, Callable[[bytes], bytes]]] = {
     bz2.decompress: _bounded(bz2.BZ2Decompressor),
     lz4.frame.decompress: _bounded(lz4.frame.LZ4FrameDecompressor),
 }
-"""Bounded unpackers of ROS 1 chunks, by the unbounded function."""
+"""Bounded decompressors of ROS 1 chunks, by the unbounded function."""
 
 
 def ros_messages(path: Path, version: int) -> Iterator[RawMessage]:
     """Yield the messages of a bag of ROS 1 (file) or 2 (folder, or one database of it).
 
-    Topics of other messages than those that are read are yielded once, without data.
+    Topics with other message types are yielded once, without data.
 
     Raises:
-        InputError: it cannot be read, is damaged, or holds packed chunks that are too large, or packed messages.
+        InputError: the bag cannot be read, is damaged, or contains compressed messages or chunks that are too large.
     """
     with reading(path, f"a bag of ROS {version}"):
         if path.is_dir() and (parts := _mcap_parts(path)) is not None:
@@ -75,11 +75,11 @@ def ros_messages(path: Path, version: int) -> Iterator[RawMessage]:
 
 
 def _require_stored(database: Path) -> None:
-    """Check that reading the database gives no more than it stores.
+    """Check that the database returns only stored data.
 
     Raises:
-        InputError: it computes rows or columns when it is read, or repeats the id of a topic.
-        sqlite3.DatabaseError: it is damaged, e.g. holds pages that are read more than once.
+        InputError: it computes rows or columns on reading, or repeats a topic id.
+        sqlite3.DatabaseError: it is damaged, e.g. pages are referenced more than once.
     """
     with closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)) as bag:
         for kind, name, declared in bag.execute("SELECT type, name, sql FROM sqlite_master").fetchall():
@@ -96,10 +96,10 @@ def _require_stored(database: Path) -> None:
 
 
 def _mcap_parts(folder: Path) -> list[Path] | None:
-    """Files of a bag of ROS 2 that is stored as MCAP; None for one that is stored otherwise.
+    """Return the files of a ROS 2 bag stored as MCAP; None for another storage.
 
     Raises:
-        InputError: its description cannot be read, or it is packed.
+        InputError: its metadata cannot be read, or the bag is compressed.
     """
     about = read_yaml(folder / METADATA)["rosbag2_bagfile_information"]
     packed = str(about.get("compression_mode") or "none").lower()

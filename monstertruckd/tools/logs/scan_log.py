@@ -1,4 +1,4 @@
-"""Scans of a log, and their common inputs for readers of any format: geometry, clocks, odometry at a scan."""
+"""Scans of a log, and the common input of all readers: geometry, clocks, odometry at a scan."""
 
 import math
 from dataclasses import dataclass, field, fields, replace
@@ -13,19 +13,19 @@ from monstertruck_kinematics.se2 import Pose2, between, interpolate
 from monstertruck_runtime.clock import SECOND
 
 BEGIN: Final = SECOND
-"""Stamp of the first scan of a log with times of another origin (ns)."""
+"""Stamp of the first scan in a log whose times have another origin (ns)."""
 SHORTEST_RANGE: Final = 0.02
 """Default minimum range of a return (m)."""
 LONGEST_RANGE: Final = 80.0
-"""Ranges from here on are no-returns of the lasers that CARMEN logs come from (m)."""
+"""Ranges at or above this mean no return in the lasers of CARMEN logs (m)."""
 
 
 @dataclass(frozen=True, slots=True)
 class LogGeometry:
-    """Geometry of the scans of a log without it; None for the log's value, or a default."""
+    """Geometry of the scans of a log that lacks it; None for the log's value or a default."""
 
     start_angle: float | None = None
-    """Angle of the first beam, rad, counter-clockwise from ahead."""
+    """Angle of the first beam (rad), counter-clockwise from straight ahead."""
     angle_increment: float | None = None
     """Angle between neighbouring beams (rad)."""
     range_min: float | None = None
@@ -33,7 +33,7 @@ class LogGeometry:
     range_max: float | None = None
     """Range without a return (m)."""
     time_increment: float | None = None
-    """Seconds between neighbouring beams."""
+    """Time between neighbouring beams (s)."""
     mount: Pose2 | None = None
     """Planar pose of the sensor in base (m, rad)."""
 
@@ -46,46 +46,46 @@ class LogGeometry:
 
 @dataclass(frozen=True, slots=True)
 class ScanLog:
-    """A log's scans, in order."""
+    """Scans of a log, in order."""
 
     make: str
     scans: list[ScanInput]
     begin: float = 0.0
-    """Time of the log's clock at stamp 0 here (s)."""
+    """Time of the log's clock at stamp 0 (s)."""
     assumed: tuple[str, ...] = field(default=())
     """Parts of the geometry that neither the log nor the caller gave."""
     fault: str | None = None
-    """Fault of the file, such as a missing end."""
+    """Damage of the file, such as a missing end."""
     sources: dict[str, str] = field(default_factory=dict)
     """Sources of scans, odometry and mount in the log, if there was a choice."""
 
 
 def vector(values: Any) -> Pose2:
-    """A pose as three floats."""
+    """Convert a pose to three floats."""
     x, y, yaw = (float(value) for value in values)
     return x, y, yaw
 
 
 def missing(known: dict[str, Any]) -> tuple[str, ...]:
-    """Fields of ``LogGeometry`` that are not ``known``."""
+    """Return the fields of ``LogGeometry`` that are not ``known``."""
     return tuple(item.name for item in fields(LogGeometry) if item.name not in known)
 
 
 def no_return(ranges: Array) -> float:
-    """Range without a return: a maximum that recurs, or infinity.
+    """Return the range that means no return: a recurring maximum, or infinity.
 
     Args:
         ranges: ranges of any shape, at least one of them finite (m).
     """
     finite = ranges[np.isfinite(ranges)]
     greatest = float(finite.max())
-    no_return_share = 0.001  # the greatest range of a log means no return if at least this share of its beams has it
+    no_return_share = 0.001  # minimum fraction of beams at a log's maximum range for that range to mean no return
     recurs = np.count_nonzero(finite == greatest) >= max(no_return_share * finite.size, 3)
     return min(greatest if recurs else math.inf, LONGEST_RANGE)
 
 
 def half_turn(stamp: int, ranges: Array, odom: Pose2 | None, geometry: dict[str, Any]) -> ScanInput:
-    """Return a scan of this ``geometry``; by default the forward 180 degrees in n beams, or n + 1 with both ends."""
+    """Return a scan with this ``geometry``; by default 180 degrees ahead in n beams, or n + 1 with both ends."""
     count = len(ranges)
     assumed = {
         "start_angle": -math.pi / 2,
@@ -96,10 +96,10 @@ def half_turn(stamp: int, ranges: Array, odom: Pose2 | None, geometry: dict[str,
 
 
 def steady_clock(*clocks: NDArray[np.int64]) -> tuple[int, NDArray[np.int64]]:
-    """Choose the clock that tells a log's scans apart.
+    """Select the clock that best separates a log's scans.
 
-    That is the first one whose smallest step is shorter than the mean time between scans. Failing that, the one with
-    the most different times, and scans of one time are spread evenly up to the next.
+    This is the first clock whose smallest step is shorter than the mean time between scans, otherwise the one with the
+    most distinct times. Scans with the same time are then spread evenly up to the next.
 
     Args:
         clocks: times of the scans by each clock, shape (n,) (ns).
@@ -108,7 +108,7 @@ def steady_clock(*clocks: NDArray[np.int64]) -> tuple[int, NDArray[np.int64]]:
         Number of the clock, and times by it.
 
     Raises:
-        ValueError: there are several scans, and all have one time by every clock.
+        ValueError: there are several scans, all with the same time on every clock.
     """
     for number, times in enumerate(clocks):
         if not _coarse(times):
@@ -134,15 +134,15 @@ def _coarse(times: NDArray[np.int64]) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class OdometryLog:
-    """Odometry of a log, to be looked up at its scans."""
+    """Odometry of a log, interpolated at its scans."""
 
     stamps: NDArray[np.int64]
-    """Shape (n,), ns, rising."""
+    """Stamps, shape (n,), increasing (ns)."""
     poses: Array
-    """Shape (n, 3), base in odom."""
+    """Poses of base in odom, shape (n, 3)."""
 
     def attached(self, scan: ScanInput) -> ScanInput:
-        """The scan with pose and velocity of base by odometry; without, where odometry does not reach."""
+        """Return the scan with pose and velocity of base from odometry; unchanged outside its time range."""
         if not len(self.stamps) or not self.stamps[0] <= scan.stamp <= self.stamps[-1]:
             return scan
         duration = scan.time_increment * len(scan.ranges)

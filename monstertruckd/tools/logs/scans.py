@@ -1,4 +1,4 @@
-"""Scans with odometry from logs of several formats: our MCAP, MCAP and bags by others, CARMEN, npz, URG text."""
+"""Scans with odometry from this program's MCAP logs, other MCAP files and bags, CARMEN, npz and URG text."""
 
 import math
 from collections.abc import Iterator
@@ -38,7 +38,7 @@ from monstertruckd.tools.logs.scan_log import (
 BAG: Final = b"#ROSBAG V"
 DATABASE: Final = b"SQLite format 3\0"
 OWN_FIELD: Final = b"codes"
-"""Name of a field that only our scans have."""
+"""Name of a field that only this program's scans have."""
 STRANGERS: Final = {
     b"version https://git-lfs": "a git-LFS pointer, not the file itself: fetch it with `git lfs pull`",
     b"\x1f\x8b": "compressed with gzip: decompress it first (CARMEN and URG text may stay compressed as NAME.gz)",
@@ -47,7 +47,7 @@ STRANGERS: Final = {
     b"\x28\xb5\x2f\xfd": "compressed with zstd: decompress it first",
     b"7z\xbc\xaf": "a 7z archive: unpack it first",
 }
-"""Formats that are refused by name, by their first bytes."""
+"""Formats that are rejected by name, by their first bytes."""
 EXPECTED: Final = "MCAP, a ROS bag, CARMEN text, npz or URG text"
 
 
@@ -55,13 +55,14 @@ def read_scans(path: Path, geometry: LogGeometry | None = None, topics: tuple[st
     """Read any log with scans.
 
     Args:
-        path: the log; of ROS 2, its folder.
-        geometry: geometry of a log that does not hold it; it overrides an npz log or a bag.
-        topics: of scans and odometry, for logs that have several; of a CARMEN log the word that its lines begin with.
+        path: the log; for ROS 2, its folder.
+        geometry: geometry of a log that lacks it; it overrides the one in an npz log or a bag.
+        topics: topics of scans and odometry, for logs with several; for a CARMEN log the first word of its lines.
 
     Raises:
         NotFoundError: no such file.
-        InputError: it is of no known format, damaged, has no scans, or brings the geometry or topics that were given.
+        InputError: the log has an unknown format, is damaged, has no scans, or already defines the given geometry or
+            topics.
     """
     given = {} if geometry is None else geometry.known
     if path.is_dir():
@@ -113,7 +114,7 @@ def _bag(path: Path, version: int, given: dict[str, Any], topics: tuple[str, ...
 
 
 def _mcap(path: Path, given: dict[str, Any], topics: tuple[str, ...]) -> ScanLog:
-    """A log of ours, or by others; ``topics`` are of the latter."""
+    """Read a log of this program or another MCAP file; ``topics`` applies only to the latter."""
     reader = open_log(path)
     if not topics and (scans := list(_own(reader))):
         return ScanLog("mcap", scans, fault=reader.fault)
@@ -123,7 +124,7 @@ def _mcap(path: Path, given: dict[str, Any], topics: tuple[str, ...]) -> ScanLog
 
 
 def _own(reader: LogReader) -> Iterator[ScanInput]:
-    """Scans of a log of ours; none of others' logs."""
+    """Yield the scans of a log of this program; none for other logs."""
     scans: list[LaserScan] = []
     rows: list[tuple[int, float, float, float]] = []
     for raw in mcap_messages(reader.records()):
@@ -144,7 +145,7 @@ def _own(reader: LogReader) -> Iterator[ScanInput]:
 
 
 def _arrays(path: Path, given: dict[str, Any]) -> ScanLog:
-    """An npz log; its geometry is ``given``, else its arrays of the same names, else assumed."""
+    """Read an npz log; its geometry is ``given``, otherwise from its arrays of the same names, otherwise assumed."""
     arrays = arrays_of(path, "arrays t, ranges and optionally odom")
     ranges = _array(path, arrays, "ranges", (-1, -1))
     times = _array(path, arrays, "t", (len(ranges),))
@@ -155,7 +156,7 @@ def _arrays(path: Path, given: dict[str, Any]) -> ScanLog:
     if len(bad):
         raise InputError(f"{path}: t: expected finite seconds, got {times[bad[0]]} in row {bad[0]}")
     span = float(np.ptp(times))
-    if span > 1e9:  # a longer npz log has other units than seconds, s
+    if span > 1e9:  # longer npz logs are in units other than seconds, s
         raise InputError(f"{path}: t: expected seconds, got a log of {span:g} s")
     if not (np.isfinite(ranges) & (ranges > 0)).any():
         raise InputError(f"{path}: ranges: expected metres, got no finite value above 0")
@@ -176,7 +177,7 @@ def _arrays(path: Path, given: dict[str, Any]) -> ScanLog:
 
 
 def _array(path: Path, arrays: dict[str, Any], name: str, shape: tuple[int, ...]) -> Array:
-    """An array of numbers of this shape (-1 = any length)."""
+    """Return a numeric array with this shape (-1 = any length)."""
     wanted = f"{path}: {name}: expected numbers of shape ({', '.join('n' if k < 0 else str(k) for k in shape)})"
     if name not in arrays:
         raise InputError(f"{wanted}, got no such array")
@@ -198,7 +199,7 @@ def _urg(path: Path) -> Iterator[ScanInput]:
     recording = RecordedRanges.load(path)
     urg_errors = 0.02  # shorter readings of a URG are error codes, m
     urg_step = math.tau / 1024
-    urg_ahead = 341  # beam of a URG recording that looks straight ahead
+    urg_ahead = 341  # beam of a URG recording that points straight ahead
     for time, row in zip(recording.times.tolist(), recording.ranges, strict=True):
         yield ScanInput(
             stamp=BEGIN + time,

@@ -1,4 +1,4 @@
-"""Summaries: of one log by reading it, of a folder's logs by their indices."""
+"""Summaries: of one log by reading it, of a folder's logs by their indexes."""
 
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ from monstertruckd.tools.logs.messages import first_offset, real_offset, utc
 
 
 def info(path: str | Path) -> dict[str, Any]:
-    """Contents of a log as plain JSON-able values.
+    """Return the contents of a log as JSON-compatible values.
 
     Returns:
         ``path``, ``size`` (bytes), ``damage`` (text or None), ``lost`` (messages known to be), ``spans`` (their times,
@@ -85,9 +85,9 @@ class LogState(StrEnum):
     FINISHED = "finished"
     WRITING = "being written"
     UNFINISHED = "unfinished"
-    """Not finished and not being written: for ``recover``."""
+    """Not finished, and not being written: repair it with ``recover``."""
     DAMAGED = "damaged"
-    """The index of the log is damaged: for ``recover``."""
+    """The index is damaged: repair it with ``recover``."""
     UNREADABLE = "unreadable"
     """Not a log, or not readable."""
 
@@ -98,21 +98,21 @@ class LogSummary:
 
     path: Path
     size: int
-    """Bytes."""
+    """Size (bytes)."""
     state: LogState
     robot: str | None = None
-    """Whose log it is; None if that is not in it."""
+    """Name of the robot; None if the log does not contain it."""
     started: str | None = None
-    """UTC; None if the date is unknown."""
+    """Start time (UTC); None if the date is unknown."""
     duration: float | None = None
-    """Seconds; None if the log is not finished."""
+    """Duration (s); None if the log is not finished."""
     messages: int | None = None
 
 
 def list_logs(folder: Path) -> list[LogSummary]:
-    """All logs in ``folder`` and below, latest last; one that is removed meanwhile is skipped.
+    """List all logs in ``folder`` and below, the latest last; files removed meanwhile are skipped.
 
-    They are sorted by their begin, or by the file's last change where that is not known.
+    They are sorted by start time, or by the file's last change if it is unknown.
 
     Raises:
         NotFoundError: no such folder.
@@ -161,7 +161,7 @@ def _summary_of(path: Path) -> LogSummary:
 
 
 def _robot(reader: LogReader) -> str | None:
-    """Its name in the attached configuration."""
+    """Return the robot's name from the attached configuration."""
     with suppress(ConfigError, InputError):
         name = reader.config().get("robot")
         return name if isinstance(name, str) else None
@@ -169,7 +169,7 @@ def _robot(reader: LogReader) -> str | None:
 
 
 def _first_date(reader: LogReader) -> str | None:
-    """UTC of the first message of a log without an index, by its run's offset at the start."""
+    """Return the date (UTC) of the first message of a log without an index, from its run's offset at the start."""
     first = next(iter(reader), None)
     if first is None:
         return None
@@ -180,8 +180,8 @@ def _first_date(reader: LogReader) -> str | None:
 
 
 def _offset(reader: LogReader) -> int:
-    """Real time minus the file's log time (ns)."""
-    reader.metadata()  # passes the metadata that names the clock of the log times
+    """Return real time minus the file's log time (ns)."""
+    reader.metadata()  # reads the metadata that defines the clock of the log times
     try:
         return real_offset(reader) - reader.log_offset
     except InputError:

@@ -1,10 +1,10 @@
-"""Trajectories as text of the TUM or KITTI benchmark, a line per scan.
+"""Trajectories in the text format of the TUM or KITTI benchmark, one line per scan.
 
 TUM: ``t x y z qx qy qz qw``, metres and seconds. KITTI: the matrix of base in map, 3 x 4, row by row, without times.
 
-A scan's stamp, and the pose estimated for it, are of its first beam. Drawing a whole scan at one pose, and comparing
-poses with another system, need the middle: so each line has the time of the middle of the sweep, by the clock of the
-log, and the pose at that time (between the poses of neighbouring scans).
+A scan's stamp and estimated pose are those of its first beam. Drawing a whole scan at one pose, or comparing poses with
+another system, requires the middle of the sweep. Each line therefore has the time of the mid-sweep on the log's clock
+and the pose interpolated to it.
 """
 
 import itertools
@@ -24,12 +24,12 @@ from monstertruckd.tools.logs.scan_log import ScanLog
 
 
 def mid_sweep(stamps: Array, poses: Array, delay: float) -> Array:
-    """Poses, shape (n, 3), ``delay`` seconds after each stamp; after the last one the last motion continues.
+    """Return the poses ``delay`` seconds after each stamp, shape (n, 3); the last motion is extrapolated.
 
     Args:
-        stamps: shape (n,), s, rising.
+        stamps: shape (n,), increasing (s).
         poses: shape (n, 3), at ``stamps``.
-        delay: s, not negative.
+        delay: delay, not negative (s).
     """
     if delay <= 0 or len(stamps) < 2:
         return poses
@@ -39,12 +39,12 @@ def mid_sweep(stamps: Array, poses: Array, delay: float) -> Array:
 
 
 def tum(time: float, x: float, y: float, yaw: float) -> str:
-    """A line of the TUM benchmark."""
+    """Return a line in TUM format."""
     return f"{time:.6f} {x:.6f} {y:.6f} 0 0 0 {math.sin(yaw / 2):.9f} {math.cos(yaw / 2):.9f}\n"
 
 
 def kitti(time: float, x: float, y: float, yaw: float) -> str:
-    """A line of the KITTI benchmark, in our axes: x forward, z up."""
+    """Return a line in KITTI format, with x forward and z up."""
     c, s = math.cos(yaw), math.sin(yaw)
     return f"{c:.9f} {-s:.9f} 0 {x:.6f} {s:.9f} {c:.9f} 0 {y:.6f} 0 0 1 0\n"
 
@@ -64,13 +64,13 @@ def write_trajectory(
     *,
     lines: Line = tum,
 ) -> str:
-    """Write poses of a log's scans; list lost ones in a second file (``poses.lost.txt``, TUM; empty if none is).
+    """Write the poses of a log's scans, and the lost ones to a second file (``poses.lost.txt``, TUM; may be empty).
 
     Args:
         path: path of the file.
-        stamps: shape (n,), ns, of the scans' first beams.
+        stamps: times of the scans' first beams, shape (n,) (ns).
         poses: shape (n, 3), base in map at ``stamps``.
-        log: where the scans are from.
+        log: log of the scans.
         lost: shape (n,), mask of lost poses; None writes no second file.
         lines: format of the first file.
 

@@ -1,4 +1,4 @@
-"""One pass over a log: everything the report shows, in bounded memory."""
+"""One pass over a log that collects all data of the report in bounded memory."""
 
 import json
 import math
@@ -30,7 +30,7 @@ from monstertruckd.tools.logs.report.states import StateTimeline
 
 @dataclass(slots=True)
 class Traffic:
-    """One topic of the log."""
+    """Statistics of one topic of the log."""
 
     name: str
     messages: int = 0
@@ -38,13 +38,13 @@ class Traffic:
     first: int = 0
     last: int = 0
     lost: int = 0
-    """Messages the recorder counted but the log does not hold."""
+    """Number of messages that were counted by the recorder but are not in the log."""
     undecodable: int = 0
     silences: int = 0
     longest_silence: float = 0.0
-    """Seconds between two messages, greatest; 0 for topics without a nominal rate."""
+    """Longest time between two messages (s); 0 for topics without a nominal rate."""
     rate: Trace = field(default_factory=Trace)
-    """Messages of each whole second, in per cent of the nominal rate."""
+    """Message rate of each whole second, in per cent of the nominal rate."""
     _sequence: int | None = None
     _second: int = 0
     _in_second: int = 0
@@ -61,7 +61,7 @@ class Traffic:
         return (self.messages - 1) * SECOND / (self.last - self.first) if self.last > self.first else None
 
     def take(self, message: LogMessage) -> None:
-        """Count a message."""
+        """Add a message."""
         now = message.log_time
         if self.messages == 0:
             self.first = self.last = now
@@ -101,12 +101,12 @@ class Traffic:
 _PERIODS: Final = {t.ODOMETRY.name: SECOND // 20, t.POSE.name: SECOND // 20, t.TRANSFORMS.name: SECOND}
 """Topics of high rate that are decoded no more often than this (ns)."""
 _EVENTS: Final = 400
-"""Events kept of each severity."""
+"""Number of events kept per severity."""
 
 
 @dataclass(slots=True)
 class RunSummary:
-    """Everything the report shows of a log."""
+    """All data of the report."""
 
     path: Path
     size: int
@@ -127,13 +127,13 @@ class RunSummary:
     events: list[Event] = field(default_factory=list)
     event_counts: dict[Severity, int] = field(default_factory=lambda: dict.fromkeys(Severity, 0))
     journal: list[LogRecord] = field(default_factory=list)
-    """The first warnings and worse."""
+    """First log records of severity warning or above."""
     journal_count: int = 0
-    """All of them."""
+    """Number of log records of severity warning or above."""
     stops: dict[int, Stop] = field(default_factory=dict)
-    """Stops by number, each as last published."""
+    """Stops by number, each as published last."""
     drops: int = 0
-    """Messages lost in the daemon's bounded queues, by its last count."""
+    """Number of messages lost in the daemon's bounded queues, by its last count."""
     way: DrivenPath = field(default_factory=DrivenPath)
     """Driven path, in the map frame if the log has poses there, else in odom."""
     odometry: DrivenPath = field(default_factory=DrivenPath)
@@ -147,34 +147,34 @@ class RunSummary:
 
     @property
     def duration(self) -> float:
-        """Seconds from first to last message."""
+        """Time from the first to the last message (s)."""
         return (self.end - self.start) / SECOND
 
     @property
     def distance(self) -> float:
-        """Metres driven by odometry; by the poses in the map where there is none."""
+        """Distance travelled by odometry, or by the poses in the map if there is none (m)."""
         return self.odometry.distance or self.way.distance
 
     @property
     def cross_track_rms(self) -> float | None:
-        """Metres, while a path was being tracked."""
+        """RMS cross-track error while tracking a path (m)."""
         return math.sqrt(self.cross_track_square / self.cross_track_count) if self.cross_track_count else None
 
     @property
     def is_black_box(self) -> bool:
-        """Pictures in it are sampled, and its metadata counts lost messages."""
+        """Whether the log is a black box, in which pictures are sampled and the metadata counts lost messages."""
         return "stopped_at_ns" in self.metadata
 
     @property
     def lost(self) -> int:
-        """Messages that were published but are not in the log."""
+        """Number of messages that were published but are not in the log."""
         if self.is_black_box:
             return int(self.metadata.get("lost", 0))
         return sum(row.lost for row in self.traffic.values())
 
 
 class Collector:
-    """Adds messages in the order of the log."""
+    """Collects messages in log order."""
 
     def __init__(self, run: RunSummary) -> None:
         self._run = run
@@ -207,7 +207,7 @@ class Collector:
         self._handlers.setdefault(topic, []).append(handler)
 
     def take(self, entry: LogMessage) -> None:
-        """Add one message; those that cannot be decoded are counted."""
+        """Add one message; undecodable ones are counted."""
         run, now = self._run, entry.log_time
         run.start = now if run.messages == 0 else min(run.start, now)
         run.end = max(run.end, now)
@@ -273,7 +273,7 @@ class Collector:
 
 
 def collect(path: str | Path, progress: Progress | None = None) -> RunSummary:
-    """Read a log, finished or not, up to its end or its first damage.
+    """Read a log, finished or not, up to its end or the first damage.
 
     Args:
         path: the log.
@@ -281,7 +281,7 @@ def collect(path: str | Path, progress: Progress | None = None) -> RunSummary:
 
     Raises:
         NotFoundError: no such log.
-        InputError: not a log, or it holds no message.
+        InputError: not a log, or it has no messages.
     """
     reader = LogReader(Path(path))
     run = RunSummary(Path(path), reader.size)
@@ -304,7 +304,7 @@ def collect(path: str | Path, progress: Progress | None = None) -> RunSummary:
 
 
 def _describe(run: RunSummary, reader: LogReader) -> None:
-    """Attachments, library and clock offset from the records before the first message."""
+    """Read attachments, library and clock offset from the records before the first message."""
     for record in reader.preamble():
         match record:
             case Header():

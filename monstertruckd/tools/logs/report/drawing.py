@@ -1,7 +1,7 @@
 """Line plots as inline SVG: pure functions from numbers to markup.
 
-A plot is stretched to any width: lines keep their width (``non-scaling-stroke``), and every label is HTML next to it,
-placed in per cent, so that nothing shrinks on a phone.
+A plot scales to any width. Lines keep their width (``non-scaling-stroke``), and labels are HTML elements positioned in
+per cent, so that they do not shrink on a phone.
 """
 
 import base64
@@ -25,25 +25,25 @@ WIDTH, HEIGHT = 1000.0, 100.0
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """Range of values and its labelled numbers."""
+    """Range of values and its ticks."""
 
     low: float
     high: float
     ticks: tuple[float, ...]
 
     def share(self, value: float) -> float:
-        """0 at ``low``, 1 at ``high``."""
+        """Return the relative position of a value: 0 at ``low``, 1 at ``high``."""
         return (value - self.low) / (self.high - self.low)
 
     def label(self, tick: float) -> str:
-        """Number with as many decimals as the ticks need."""
+        """Format a number with as many decimals as the ticks need."""
         step = self.ticks[1] - self.ticks[0] if len(self.ticks) > 1 else 1.0
         decimals = max(0, -math.floor(math.log10(step) + 1e-9))
         return f"{tick:.{decimals}f}".replace("-", "−")
 
 
 def value_axis(values: Iterable[float], span: float, *, zero: bool) -> Axis:
-    """Axis with rounded limits enclosing all ``values``, at least ``span`` wide, optionally including zero."""
+    """Return an axis with rounded limits around ``values``, at least ``span`` wide, optionally including zero."""
     shown = [*values, *([0.0] if zero else [])]
     low, high = min(shown), max(shown)
     if high - low < span:
@@ -56,20 +56,20 @@ def value_axis(values: Iterable[float], span: float, *, zero: bool) -> Axis:
 
 
 def round_step(about: float) -> float:
-    """The nearest of 1, 2, 5 times a power of ten that is not smaller."""
+    """Round up to 1, 2 or 5 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(about))
     return next(factor * power for factor in (1, 2, 5, 10) if factor * power >= about * (1 - 1e-9))
 
 
 def time_ticks(seconds: float) -> list[float]:
-    """Round instants of a run of ``seconds``."""
+    """Return round tick times for a run of ``seconds``."""
     time_steps = (0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400)
-    step = next((s for s in time_steps if seconds / s <= 9), 86400.0)  # ticks of the time axis at most
+    step = next((s for s in time_steps if seconds / s <= 9), 86400.0)  # maximum number of ticks on the time axis
     return [n * step for n in range(math.floor(seconds / step) + 1)]
 
 
 def clock_text(seconds: float, decimals: int = 0) -> str:
-    """``m:ss`` or ``h:mm:ss`` with that many decimals."""
+    """Format a time as ``m:ss`` or ``h:mm:ss`` with that many decimals."""
     whole, fraction = divmod(round(seconds * 10**decimals), 10**decimals)
     hours, rest = divmod(whole, 3600)
     minutes, rest = divmod(rest, 60)
@@ -78,7 +78,7 @@ def clock_text(seconds: float, decimals: int = 0) -> str:
 
 
 def line(trace: Trace, axis: Axis, start: int, end: int) -> str:
-    """SVG path data of a trace from ``start`` to ``end`` (ns); intervals are drawn from extreme to extreme."""
+    """Return the SVG path of a trace from ``start`` to ``end`` (ns); intervals are drawn from minimum to maximum."""
     duration = max(end - start, 1)
     parts = []
     for piece in trace.pieces():
@@ -107,7 +107,7 @@ def _corners(bucket: Bucket) -> Sequence[tuple[int, float]]:
 
 
 def _bent(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Without the points in the middle of level stretches; a single point becomes a short dash."""
+    """Remove the inner points of level stretches; a single point becomes a short dash."""
     if len(points) == 1:
         x, y = points[0]
         return [(x, y), (x + 1.0, y)]
@@ -125,7 +125,7 @@ def _short(number: float) -> str:
 def plot(
     number: int, title: str, unit: str, lines: Sequence[tuple[str, Trace]], axis: Axis, span: tuple[int, int]
 ) -> str:
-    """A captioned plot with grid, labels and legend.
+    """Return a plot with caption, grid, labels and legend.
 
     Args:
         number: number of the plot on the page, for the cursor.
@@ -158,7 +158,7 @@ def plot(
 
 
 def time_labels(seconds: float) -> str:
-    """The row of instants under a plot."""
+    """Return the row of time labels under a plot."""
     ticks = time_ticks(seconds)
     decimals = 1 if len(ticks) > 1 and ticks[1] < 1 else 0
     labels = "".join(
@@ -174,7 +174,7 @@ Lines = list[tuple[str, Trace]]
 
 
 def plotted(run: RunSummary) -> list[tuple[str, str, float, bool, Lines]]:
-    """Title, unit, least span, zero and lines of every plot that has samples."""
+    """Return title, unit, minimum span, zero and lines of every plot that has samples."""
     plots = []
     for figure in FIGURES:
         lines = [(curve.label, run.traces[curve]) for curve in figure.curves if run.traces[curve].count]
@@ -191,7 +191,7 @@ def plotted(run: RunSummary) -> list[tuple[str, str, float, bool, Lines]]:
 
 
 def plots(run: RunSummary, chosen: list[tuple[str, str, float, bool, Lines]]) -> str:
-    """All plots, one under the other on one axis of time."""
+    """Return all plots, stacked on a common time axis."""
     drawings = []
     for number, (title, unit, span, zero, lines) in enumerate(chosen):
         extremes = [value for _, trace in lines for value in (trace.low, trace.high) if value is not None]
@@ -201,7 +201,7 @@ def plots(run: RunSummary, chosen: list[tuple[str, str, float, bool, Lines]]) ->
 
 
 def timeline(run: RunSummary) -> str:
-    """Bars of the states, marks of warnings and errors."""
+    """Return bars for the states and marks for warnings and errors."""
     states = run.states
     rows = [track for track in states.main if track.worst is not Tone.NONE]
     steady: list[StateTrack] = []
@@ -221,7 +221,7 @@ def timeline(run: RunSummary) -> str:
 
 
 def _always_ready(track: StateTrack) -> bool:
-    """Services that started, were ready, and ended with the daemon: not shown."""
+    """Whether a service started, was ready, and ended with the daemon; its row is not shown."""
     return track.worst is not Tone.NONE and [s.text for s in track.spans if s.text not in {"starting", "stopped"}] in (
         ["ready"],
         [],
@@ -234,12 +234,12 @@ def _share(run: RunSummary, time: int) -> float:
 
 def _bars(run: RunSummary, track: StateTrack) -> str:
     bars = []
-    # 1000: greatest number of bars in a row of the timeline, about
+    # 1000: approximate maximum number of bars in a row of the timeline
     for span in merged_spans(track.spans, (run.end - run.start) // 1000):
         left, width = _share(run, span.start), _share(run, span.end) - _share(run, span.start)
         when = f"{clock_text((span.start - run.start) / SECOND, 1)}, {span.seconds:.1f} s"
         title = ": ".join(filter(None, (f"{span.text} at {when}", span.detail)))
-        wide = width > 0.055  # bars at least this share of the row carry their text
+        wide = width > 0.055  # minimum width of a bar with text, as a fraction of the row
         bars.append(
             f'<i class="{span.tone.name.lower()}{"" if wide else " thin"}" style="left:{100 * left:.3f}%;'
             f'width:{100 * width:.3f}%" title="{escape(title)}">{escape(span.text) if wide else ""}</i>'
@@ -258,7 +258,7 @@ def _mark(run: RunSummary, event: Event) -> str:
 
 
 def scene(run: RunSummary) -> str:
-    """Path over the map of the lidar; empty if the log has neither."""
+    """Return the path over the lidar map; empty if the log has neither."""
     picture = run.map.picture()
     planned = [] if run.path_plan is None else [(x, y) for x, y, _ in run.path_plan.poses.reshape(-1, 3).tolist()]
     driven = [(x, y) for _, x, y in run.way.points]
@@ -311,7 +311,7 @@ def _around(points: list[tuple[float, float]], area: Area | None) -> Area:
     xs, ys = [x for x, _ in points], [y for _, y in points]
     if area is not None:
         xs, ys = [*xs, area.x0, area.x1], [*ys, area.y0, area.y1]
-    margin = 0.35  # metres shown round everything on the map
+    margin = 0.35  # margin around the content of the map, m
     return Area(min(xs) - margin, min(ys) - margin, max(xs) + margin, max(ys) + margin)
 
 

@@ -1,4 +1,4 @@
-"""The report as one HTML page: no request leaves it, and it opens from a file."""
+"""The report as one self-contained HTML page, which makes no network requests."""
 
 import json
 from collections.abc import Iterable
@@ -31,7 +31,7 @@ class RunReport:
     run: RunSummary
 
     def figures(self) -> dict[str, Any]:
-        """The figures at the top of the page, as plain data."""
+        """Figures at the top of the page, as plain data."""
         run = self.run
         return {
             "file": str(self.file),
@@ -59,7 +59,7 @@ def report(log: str | Path, output: str | Path | None = None, progress: Progress
 
     Raises:
         NotFoundError: no such log.
-        InputError: not a log, without messages, or the page cannot be written or would overwrite a log.
+        InputError: not a log, no messages, or the page cannot be written or would overwrite a log.
     """
     file = Path(log).with_suffix(".html") if output is None else Path(output)
     run = collect(log, progress)
@@ -73,18 +73,18 @@ def report(log: str | Path, output: str | Path | None = None, progress: Progress
 
 
 def robot(run: RunSummary) -> str:
-    """Name of the robot by its configuration."""
+    """Return the robot's name from its configuration."""
     return str(run.attachments.get("config", {}).get("robot") or run.metadata.get("robot", "unknown robot"))
 
 
 def began(run: RunSummary) -> str | None:
-    """Date of the first message, UTC; None if the log knows none."""
+    """Return the date of the first message (UTC); None if the log has no date."""
     real = run.start + (run.offset or 0)
     return utc(real) if is_date(real) else None
 
 
 def page(run: RunSummary) -> str:
-    """The whole page."""
+    """Return the whole page."""
     here = files(__package__)
     chosen = plotted(run)
     title = f"{robot(run)}, {began(run) or run.path.name}"
@@ -136,7 +136,7 @@ def _head(run: RunSummary) -> str:
 
 
 def _calibration_badges(run: RunSummary) -> Iterable[tuple[str, Tone]]:
-    """Grades of the calibration that the daemon began with, and what of it had expired; none in logs before these."""
+    """Yield the grades of the calibration at the start of the daemon, and its expired parts; none in older logs."""
     rows = run.attachments.get("calibration", {}).get("wizards", ())
     if counting := [f"{row['wizard']} {row['grade']}" for row in rows if not row["expired"]]:
         yield f"calibration: {', '.join(counting)}", Tone.GOOD
@@ -191,7 +191,7 @@ def _short(value: float | str | bool | None) -> str:
 
 
 def _stops(run: RunSummary) -> str:
-    """Every stop with its chain of causes."""
+    """Return every stop with its chain of causes."""
     rows = "".join(_stop(run, stop) for stop in run.stops.values())
     return f'<h2>Stops</h2><div class="card stops">{rows}</div>' if rows else ""
 
@@ -227,7 +227,7 @@ def _cause(run: RunSummary, cause: Cause) -> str:
 
 
 def _journal(run: RunSummary) -> str:
-    """Warnings and errors of the journal."""
+    """Return the warnings and errors of the journal."""
     rows = "".join(
         f'<li data-at="{1e3 * (seconds := max(record.stamp - run.start, 0) / SECOND):.0f}">'
         f"<time>{clock_text(seconds, 2)}</time><div>"
@@ -294,7 +294,7 @@ def _table(
     wide: int | None = None,
     alarm: set[int] = frozenset(),  # type: ignore[assignment]
 ) -> str:
-    """A table of markup; columns in ``alarm`` are highlighted where not 0."""
+    """Return an HTML table; values other than 0 in columns ``alarm`` are highlighted."""
     top = "".join(f"<th{' class=n' if n in right else ''}>{escape(head)}</th>" for n, head in enumerate(heads))
 
     def cell(n: int, text: str) -> str:
@@ -306,7 +306,7 @@ def _table(
 
 
 def _details(run: RunSummary) -> str:
-    """Attachments of the log, folded."""
+    """Return the attachments of the log, collapsed."""
     versions = run.attachments.get("versions", {})
     text = ", ".join(f"{name} {version}" for name, version in sorted(versions.items()))
     blocks = "".join(
@@ -322,7 +322,7 @@ def _details(run: RunSummary) -> str:
 
 
 def _data(run: RunSummary, chosen: list[tuple[str, str, float, bool, Lines]]) -> str:
-    """Values for the cursor; times in ms since the start."""
+    """Return the values for the cursor; times in ms since the start."""
 
     def milliseconds(times: Iterable[int]) -> list[int]:
         return [int(time - run.start) // 1_000_000 for time in times]

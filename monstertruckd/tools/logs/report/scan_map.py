@@ -22,20 +22,20 @@ from monstertruckd.recorder.occupancy import Area, OccupancyRaster
 
 _MAX_TILT: Final = math.radians(3)
 _STEP, _TURN, _REST = 0.08, 0.1, 20 * SECOND
-"""A scan is taken after this way (m), this turn (rad) or this time (ns) since the one before."""
+"""Distance (m), turn (rad) or time (ns) since the previous scan at which the next one is added."""
 _WALL, _FREE = 28.0, 255.0
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A raster as PNG with transparency: unknown is clear, free white, walls dark."""
+    """Raster as PNG with transparency: unknown is transparent, free white, walls dark."""
 
     png: bytes
     area: Area
 
 
 class PlacedScans:
-    """Places scans at the poses the log gives for them."""
+    """Places scans at the poses given by the log."""
 
     def __init__(self) -> None:
         self._mounts = FrameTree()
@@ -47,16 +47,16 @@ class PlacedScans:
         return self._poses[-1] if self._poses else None
 
     def pose(self, odometry: Odometry) -> None:
-        """The truck's latest pose in the map."""
+        """Set the truck's latest pose in the map."""
         pose = odometry.pose
         self._poses.append((odometry.stamp, pose.x, pose.y, pose.yaw))
 
     def transforms(self, tree: Transforms) -> None:
-        """The frames, for the lidar's mount."""
+        """Set the frame tree, for the lidar's mount."""
         self._mounts = FrameTree(tree.transforms)
 
     def place(self, scan: LaserScan) -> tuple[Array, Array]:
-        """Place of the lidar, shape (2,), and its returns, shape (n, 2) (m); at least one pose must be known."""
+        """Return the position of the lidar, shape (2,), and its returns, shape (n, 2) (m); requires a known pose."""
         x, y, yaw = self._pose_at(scan.stamp + round(scan.scan_time / 2 * SECOND))
         mount = self._mount(scan.frame) or (0.0, 0.0, 0.0)
         cos, sin = math.cos(yaw), math.sin(yaw)
@@ -65,7 +65,7 @@ class PlacedScans:
         return at + np.array(mount[:2]) @ turn, at + scan_points(scan, mount) @ turn
 
     def arcs(self, ranges: SonarRanges) -> list[Array]:
-        """For each echo of a sonar whose place is known the arc it lies on, (n, 2) (m); at least one pose is known."""
+        """Return the arc of each echo of a sonar with a known mount, (n, 2) (m); requires a known pose."""
         found = []
         for echo in ranges.sonars:
             mount = self._mount(f"sonar_{echo.name}")
@@ -87,7 +87,7 @@ class PlacedScans:
 
 
 class ScanMap:
-    """Gathers scans; an occupancy grid in the log takes their place."""
+    """Collects scans for a map; an occupancy grid in the log replaces it."""
 
     def __init__(self) -> None:
         self.scans = PlacedScans()
@@ -96,11 +96,11 @@ class ScanMap:
         self._taken: tuple[int, float, float, float] | None = None
 
     def grid(self, grid: Grid) -> None:
-        """A newer occupancy grid."""
+        """Set a newer occupancy grid."""
         self._grid = grid
 
     def scan(self, scan: LaserScan) -> None:
-        """Take in a scan if the truck has moved since the one before."""
+        """Add a scan if the truck has moved since the previous one."""
         newest = self.scans.newest
         if self._grid is not None or newest is None or (scan.tilt or 0.0) > _MAX_TILT:
             return
@@ -110,7 +110,7 @@ class ScanMap:
         self._raster.add(*self.scans.place(scan))
 
     def picture(self) -> Picture | None:
-        """Map of the collected data; None without scans and grids."""
+        """Return the map of the collected data; None without scans and grids."""
         if self._grid is not None:
             return _grid_picture(self._grid)
         occupancy = self._raster.occupancy()
@@ -130,7 +130,7 @@ def _grid_picture(grid: Grid) -> Picture:
 
 
 def _picture(occupancy: Array, area: Area) -> Picture:
-    """Map from fractions of hits, row 0 lowest, NaN unknown; cropped to the known cells."""
+    """Return the map from fractions of hits, row 0 lowest, NaN unknown; cropped to the known cells."""
     known = np.isfinite(occupancy)
     rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
     cell = (area.x1 - area.x0) / occupancy.shape[1]

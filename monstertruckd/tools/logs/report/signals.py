@@ -39,12 +39,12 @@ class Bucket:
 
 
 class Trace:
-    """Samples in the order of their times; at least ``limit / 2`` intervals once there are more samples than ``limit``.
+    """Samples in time order; more than ``limit`` of them are aggregated to at least ``limit / 2`` intervals.
 
-    Extremes survive, so that a spike of one sample shows in an hour.
+    Extremes are kept, so that a single-sample spike is visible in an hour of data.
 
     Args:
-        limit: greatest number of intervals kept.
+        limit: maximum number of intervals kept.
     """
 
     def __init__(self, limit: int = 1000) -> None:
@@ -80,7 +80,7 @@ class Trace:
         return max((bucket.high for bucket in self.buckets), default=None)
 
     def pieces(self) -> list[list[Bucket]]:
-        """The intervals, cut where samples are missing for longer than five mean periods and a second."""
+        """Return the intervals, split where samples are missing for longer than five mean periods and one second."""
         if not self.buckets:
             return []
         period = (self.buckets[-1].last - self.buckets[0].first) / max(self.count - 1, 1)
@@ -93,7 +93,7 @@ class Trace:
         return pieces
 
     def middle(self) -> tuple[NDArray[np.int64], Array]:
-        """Times, ns, and mid values of the intervals, both of shape (n,)."""
+        """Return times (ns) and mid values of the intervals, both of shape (n,)."""
         times = np.array([(bucket.first + bucket.last) // 2 for bucket in self.buckets], np.int64)
         return times, np.array([fmean((bucket.low, bucket.high)) for bucket in self.buckets], np.float64)
 
@@ -104,26 +104,26 @@ Value = Callable[[Any], float | None]
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """One line of a figure."""
+    """One curve of a figure."""
 
     label: str
     topic: Topic[Any]
     value: Value
     turns: bool = False
-    """An angle in degrees, drawn without its jumps of 360."""
+    """Whether the value is an angle in degrees, drawn without jumps of 360."""
 
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """Curves that share an axis; figures without samples are left out."""
+    """Curves with a common axis; figures without samples are omitted."""
 
     title: str
     unit: str
     span: float
-    """The axis covers at least this much, so that noise stays small."""
+    """Minimum span of the axis, so that noise stays small."""
     curves: tuple[Curve, ...]
     zero: bool = False
-    """The axis shows zero."""
+    """Whether the axis includes zero."""
 
 
 def _degrees(name: str) -> Value:
@@ -258,10 +258,10 @@ _LEAST_STEP: Final = 0.02
 
 @dataclass(slots=True)
 class DrivenPath:
-    """Positions, sampled to a bounded number, and the distance along all of them."""
+    """Driven positions, sampled to a bounded number, and the distance along all of them."""
 
     points: list[tuple[int, float, float]] = field(default_factory=list)
-    """Time (ns); x, y (m)."""
+    """Time (ns), x and y (m)."""
     distance: float = 0.0
     _last: tuple[float, float] | None = None
     _spacing: float = _LEAST_STEP

@@ -15,10 +15,10 @@ from monstertruck_schemas.usb import UsbState, UsbTree
 
 
 class Tone(IntEnum):
-    """How a state is coloured; greater is worse."""
+    """Colour of a state; larger is worse."""
 
     NONE = 0
-    """Not merged_spans."""
+    """Not drawn."""
     CALM = 1
     GOOD = 2
     BUSY = 3
@@ -38,7 +38,7 @@ class StateSpan:
 
     @property
     def seconds(self) -> float:
-        """How long it held."""
+        """Duration (s)."""
         return (self.end - self.start) / SECOND
 
 
@@ -59,7 +59,7 @@ class StateTrack:
         self.spans.append(StateSpan(time, time, text, tone, detail))
 
     def close(self, end: int) -> None:
-        """End the latest state at ``end``."""
+        """End the current state at ``end``."""
         if self.spans:
             self.spans[-1] = replace(self.spans[-1], end=max(end, self.spans[-1].start))
 
@@ -69,12 +69,12 @@ class StateTrack:
         return max((span.tone for span in self.spans), default=Tone.NONE)
 
     def seconds(self, text: str) -> float:
-        """How long ``text`` held in all."""
+        """Return the total duration of the state ``text`` (s)."""
         return sum(span.seconds for span in self.spans if span.text == text)
 
 
 def merged_spans(spans: list[StateSpan], shortest: int) -> list[StateSpan]:
-    """Spans to draw: neighbours both shorter than ``shortest`` ns are merged into one, of the worse state."""
+    """Return the spans to draw: neighbours shorter than ``shortest`` (ns) are merged and take the worse state."""
     merged: list[StateSpan] = []
     for span in spans:
         if merged and span.end - span.start < shortest and merged[-1].end - merged[-1].start < shortest:
@@ -121,7 +121,7 @@ _USB: Final = {
     UsbState.HELD: Tone.WARNING,
 }
 _NORMAL: Final = {"disarmed"}
-"""Limits that the gate's row shows already."""
+"""Limits that the gate's row already shows."""
 
 
 class StateTimeline:
@@ -153,7 +153,7 @@ class StateTimeline:
 
     @property
     def main(self) -> tuple[StateTrack, ...]:
-        """Rows that are always worth showing."""
+        """Rows that are always shown."""
         return self.gate, self.driver, self.limit, self.motor, self.battery
 
     def _gate(self, now: int, gate: GateState) -> None:
