@@ -29,7 +29,7 @@ def default_jobs() -> int:
 
 @dataclass(frozen=True, slots=True)
 class DrillLeg:
-    """One truck's share of a drill; can be sent to another process."""
+    """Share of one truck in a drill; can be sent to another process."""
 
     config: dict[str, Any]
     """Configuration of the simulated truck, as plain values."""
@@ -37,7 +37,7 @@ class DrillLeg:
     number: int
     count: int
     faults: tuple[str, ...] = ()
-    """Kinds of faults that are drawn; empty: all that the robot can have."""
+    """Kinds of faults to draw; empty: all that the robot can have."""
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -63,7 +63,7 @@ class LegFile(Generic[Outcome]):
         adapter: adapter of a leg's outcomes.
 
     Raises:
-        InputError: it cannot be read or written, or is of another drill or program.
+        InputError: the file cannot be read or written, or belongs to another drill or program.
     """
 
     def __init__(self, path: Path, leg: DrillLeg, adapter: TypeAdapter[list[Outcome]]) -> None:
@@ -72,11 +72,11 @@ class LegFile(Generic[Outcome]):
         self._header = {"seed": leg.seed, "program": _digest(leg.settings)}
         self._found: dict[tuple[int, int], list[Outcome]] = {}
         self._end = 0
-        """Bytes of whole lines: an interrupted program leaves part of one."""
-        most_bytes = 100 * MEGABYTE  # size of a file of outcomes at most: a campaign of a million trials
+        """Size of the complete lines (bytes): an interrupted program leaves an incomplete one."""
+        most_bytes = 100 * MEGABYTE  # maximum size of a file of outcomes: a campaign of a million trials
         data = contents(path, "outcomes of a drill", most_bytes) if path.exists() else b""
         try:
-            path.open("ab").close()  # before the first leg, not after it: it must be possible to write
+            path.open("ab").close()  # the file must be writable before the first leg, not only after it
         except OSError as error:
             raise InputError(f"{path}: {error.strerror}") from error
         self._end = data.rfind(b"\n") + 1
@@ -144,7 +144,7 @@ def _digest(config: dict[str, Any]) -> str:
 
 @contextmanager
 def without_log() -> Iterator[None]:
-    """Disable logging of this process."""
+    """Disable logging in this process."""
     quiet = logging.root.manager.disable
     logging.disable(logging.CRITICAL)
     try:

@@ -41,14 +41,14 @@ QUIET: Final = frozenset(
         Reason.CLIPPED,
         Reason.SERVO_LIMIT,
         Reason.OBSTACLE_SLOW,
-        Reason.NOT_ARMED_SPEED,  # of the order to arm a truck that still stops
+        Reason.NOT_ARMED_SPEED,  # refusal of the order to arm a truck that has not stopped yet
     }
 )
-"""Reasons that explain nothing."""
+"""Reasons that do not explain a stop."""
 OBSTACLE: Final = frozenset({Reason.OBSTACLE_STOP, Reason.OBSTACLE_SLOW})
-"""Reasons of a truck that stands, or creeps, before something."""
+"""Reasons for stopping or creeping in front of an obstacle."""
 TRACKER_IN_WORKER: Final[dict[str, Any]] = {"placement": {"tracker": "worker"}}
-"""Overlay of every second truck."""
+"""Overlay of every second truck: the tracker runs in a worker."""
 
 
 def wired(config: SimulatedTruckConfig) -> SimulatedTruckConfig:
@@ -89,22 +89,22 @@ class FaultOutcome:
     kind: FaultKind
     must_stop: bool
     reason: Reason | None = None
-    """First one that gate, services or events gave."""
+    """First reason that gate, services or events reported."""
     stop_bytes_s: float | None = None
     standstill_s: float | None = None
     metres: float = 0.0
-    """Truly travelled to standstill, or until the fault's end."""
+    """True distance travelled until standstill or the fault's end (m)."""
     recovered_s: float | None = None
-    """All services ready, and the truck drives again when armed; 0: nothing was lost."""
+    """Time until all services are ready and the truck drives when armed (s); 0: nothing was lost."""
     stuck: tuple[str, ...] = ()
-    """Services that did not recover, or reasons that keep the truck from driving."""
+    """Services that did not recover, or reasons that prevent driving."""
     blocked: bool = False
-    """The truck works, but stands before an obstacle: it has to be moved by hand."""
+    """Whether the truck works but has stopped in front of an obstacle: it has to be moved by hand."""
     violations: tuple[Violation, ...] = ()
 
     @property
     def reaction(self) -> str:
-        """Outcome in one word."""
+        """Return the outcome in one word."""
         if self.violations:
             return "UNSAFE"
         if self.stuck:
@@ -115,12 +115,12 @@ class FaultOutcome:
 
     @property
     def score(self) -> int:
-        """100: safe, recovered in time; 80: safe, late; 50: safe, not recovered; 0: unsafe."""
+        """Score: 100: safe, recovered in time; 80: safe, late; 50: safe, not recovered; 0: unsafe."""
         if self.violations:
             return 0
         if self.stuck or self.recovered_s is None:
             return 50
-        # 4.0: seconds within which everything should be back: the goal of a lost hub
+        # 4.0: recovery time that counts as in time (s): the goal for a lost hub
         return 100 if self.recovered_s <= 4.0 else 80
 
 
@@ -133,12 +133,12 @@ class DrillReport:
 
     @property
     def unsafe(self) -> int:
-        """Faults with unsafe motion."""
+        """Number of faults with unsafe motion."""
         return sum(bool(outcome.violations) for outcome in self.outcomes)
 
     @property
     def stuck(self) -> int:
-        """Faults without recovery."""
+        """Number of faults without recovery."""
         return sum(bool(outcome.stuck) for outcome in self.outcomes)
 
     @property
@@ -181,14 +181,14 @@ def check_drivable(config: SimulatedTruckConfig) -> None:
     """Reject a robot without motors.
 
     Raises:
-        InputError: its body lacks motors or steering.
+        InputError: the body lacks motors or steering.
     """
     if (lack := config.missing_actuators()) is not None:
         raise InputError(f"{config.robot} cannot drive: its body needs {lack}")
 
 
 class Drill:
-    """``count`` faults of one seed.
+    """Drill of ``count`` faults from one seed.
 
     Args:
         seed: source of all randomness.
@@ -201,7 +201,7 @@ class Drill:
         InputError: nothing drives the robot, its tracker has no path, or it cannot have one of the ``faults``.
     """
 
-    # 25: faults of one truck
+    # 25: number of faults per truck
     def __init__(
         self, seed: int, count: int, config: SimulatedTruckConfig, *, leg: int = 25, faults: Iterable[FaultKind] = ()
     ) -> None:
@@ -211,7 +211,7 @@ class Drill:
         self.seed = seed
         self.count = count
         self.unguarded = unguarded(wired(config))
-        """Motor controllers that no fault cuts off, for nothing would stop them."""
+        """Motor controllers that no fault disconnects, because nothing would stop them."""
         self._config = config
         self._leg = leg
         self._faults = tuple(dict.fromkeys(faults))
@@ -273,7 +273,7 @@ class _LegRun:
             async with DrillTruck.running(self._config, self._clock, by_station=by_station) as truck:
                 await truck.until(lambda: not truck.blockers(), RECOVERY_LIMIT)  # called within this turn only
                 for fault in left:
-                    # 5: every so many faults are followed by an emergency stop, the others by a disarm order
+                    # 5: every fifth fault is followed by an emergency stop, the others by a disarm order
                     order = Order.DISARM if (len(self._outcomes) + 1) % 5 else Order.ESTOP
                     outcome = await _react(truck, fault, float(self._rng.uniform(0.1, 0.7)), order)
                     if outcome is None:
@@ -334,7 +334,7 @@ async def _react(truck: DrillTruck, fault: CatalogFault, cruise: float, order: O
         observer.disarm()
     stopping = asyncio.create_task(truck.order(order), name="stopping")
     await clock.sleep(STOPS_WITHIN / 10)
-    if abs(observer.speed) > 0.05:  # true speed of a truck that may not be armed yet, m/s
+    if abs(observer.speed) > 0.05:  # true speed above which a truck must not be armed, m/s
         await truck.order(Order.ARM)  # must be refused
     await stopping
     await clock.sleep(STOPS_WITHIN / 2)
@@ -352,7 +352,7 @@ async def _react(truck: DrillTruck, fault: CatalogFault, cruise: float, order: O
     blocked = not OBSTACLE.isdisjoint(blockers) and observer.before_something()
     if blocked:
         blockers = ()
-    drove_on = standstill is not None and standstill > fault.hold  # it stood only because it was disarmed
+    drove_on = standstill is not None and standstill > fault.hold  # the truck stood only because it was disarmed
     return FaultOutcome(
         fault.name,
         fault.kind,

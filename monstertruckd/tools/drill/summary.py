@@ -38,7 +38,9 @@ def by_family(outcomes: Iterable[TrialOutcome]) -> list[FamilySummary]:
 
 
 def _summary(family: str, outcomes: list[TrialOutcome]) -> FamilySummary:
-    own = [o for o in outcomes if o.families[0] == family and o.reason is not None]  # maybe the other fault of a pair
+    own = [
+        o for o in outcomes if o.families[0] == family and o.reason is not None
+    ]  # the reason may belong to the other fault of a pair
     times = [o.reason_s for o in own if o.reason_s is not None]
     reasons = Counter(o.reason for o in own).most_common(1)
     return FamilySummary(

@@ -35,7 +35,7 @@ from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
 OPTIONAL: Final = frozenset({"recorder"})
-"""Services that a fault may end for the rest of a run: driving continues without them."""
+"""Services that a fault may end for the rest of a run, because driving continues without them."""
 
 RANGE_SENSORS: Final = frozenset({DeviceRole.LIDAR, DeviceRole.SONAR})
 """Roles of range sensors."""
@@ -57,11 +57,11 @@ class DrivingStation:
         self.speed = speed
         self.front = front
         self.rear = 0.0
-        """Angle of its rear axle (rad)."""
+        """Requested rear axle angle (rad)."""
         self.unseen = False
-        """The operator holds the second control, which lets the robot drive into unseen ground."""
+        """Whether the operator holds the second control, which permits driving into unseen ground."""
         self.twist: RequestedTwist | None = None
-        """Requested instead of speed and angles, which are 0 then."""
+        """Requested twist instead of speed and angles, which are then 0."""
         self._clock = clock
         self._seq = 0
         self.attach(bus)
@@ -76,7 +76,7 @@ class DrivingStation:
         """Send until cancelled."""
         while True:
             self.send()
-            await self._clock.sleep(0.05)  # seconds from one request of a station to the next
+            await self._clock.sleep(0.05)  # interval between requests of a station (s)
 
     def send(self) -> None:
         """Send one request, unless silent."""
@@ -109,7 +109,9 @@ STEERING: Final[Mapping[str, tuple[str, ...]]] = {
     "front": ("front",),
     "parallel": ("crab",),
 }
-"""Steering modes of a wanderer, by a body's freedom: front axle alone, both opposed, both parallel, each by itself."""
+"""Steering modes of a wanderer by the body's degrees of freedom: front axle alone, both opposed, both parallel, each
+independent.
+"""
 
 
 def _can(chassis: Chassis, twist: Twist2) -> bool:
@@ -164,7 +166,7 @@ class Wanderer(DrivingStation):
         self._twists = tuple(twist for twist in ((0.0, 0.0, 0.5), (0.0, 0.1, 0.0)) if _can(chassis, twist))
         self._until = 0
         self.backwards: bool | None = None
-        """Only backwards or forwards from now on; None: either."""
+        """Restriction to one direction of travel; None: either."""
 
     def choose(self, *, backwards: bool | None = None) -> None:
         """Choose another motion and its duration; ``backwards`` as the attribute, for this motion and later ones."""
@@ -177,13 +179,13 @@ class Wanderer(DrivingStation):
         free = float(rng.uniform(-1.0, 1.0)) * self._angle
         self.rear = {"front": 0.0, "counter": -self.front, "crab": self.front, "free": free}[steering]
         self.twist = None
-        # 0.3: share of motions on the spot or sideways, of a body that can do them
+        # 0.3: fraction of motions on the spot or sideways, for a body that can do them
         if backwards is None and self._twists and rng.random() < 0.3:
             vx, vy, wz = float(rng.uniform(-1.0, 1.0)) * np.array(self._twists[rng.integers(len(self._twists))])
             self.speed = self.front = self.rear = 0.0
             self.twist = RequestedTwist(vx=float(vx), vy=float(vy), wz=float(wz))
         self.unseen, self._refused_since = False, None
-        # (0.4, 2.0): time that a wanderer keeps a speed and its angles, s
+        # (0.4, 2.0): duration of a wanderer's motion, s
         self._until = self._clock.now() + round(float(rng.uniform(0.4, 2.0)) * SECOND)
 
     def run_up(self, seconds: float) -> None:
@@ -203,7 +205,7 @@ class Wanderer(DrivingStation):
             self._refused_since = None
         elif self._refused_since is None:
             self._refused_since = now
-        # 0.5: waiting time of a wanderer before unseen ground until it holds the second control, s
+        # 0.5: waiting time before unseen ground until a wanderer holds the second control, s
         elif now - self._refused_since >= 0.5 * SECOND:
             self.unseen = True
         if self.unseen and not self.silent:
@@ -250,11 +252,11 @@ class GoalGiver:
                 with suppress(TruckError):
                     pose = {"x": x, "y": y, "yaw": float(self._rng.uniform(-math.pi, math.pi))}
                     await truck.operator.call("goal", {**await truck.operator.header(), "frame": "map", "goal": pose})
-            await truck.clock.sleep(0.5)  # seconds from one look of a giver of goals to the next
+            await truck.clock.sleep(0.5)  # interval between checks for a missing goal (s)
 
 
 class DrillTruck:
-    """One rig with its operator and observer.
+    """A simulated truck with its operator and observer.
 
     Args:
         rig: rig that is not running yet.
@@ -275,7 +277,7 @@ class DrillTruck:
     ) -> None:
         self.rig = rig
         self.by_hand = by_hand
-        """The operator at the station drives."""
+        """Whether the operator at the station drives."""
         self.clock = rig.clock
         self.judge = WorldJudge(rig.world, rig.clock) if judged else None
         self._observer = None if judged else Observer(rig.config, rig.world, rig.ports, rig.clock)
@@ -290,7 +292,7 @@ class DrillTruck:
         elif by_station:
             # 0.5: radius of a station's circle with a robot without a tracker, m
             angle = min(math.atan(rig.config.geometry.wheelbase / 0.5), rig.config.gate.angle)
-            # 0.8: speed that the station requests, as a share of the gate's limit
+            # 0.8: speed that the station requests, as a fraction of the gate's limit
             self.station = DrivingStation(rig.bus, rig.clock, 0.8 * rig.config.gate.speed, angle)
 
     def _looks(self) -> Callable[[Twist2], bool]:
@@ -301,7 +303,7 @@ class DrillTruck:
 
     @property
     def observer(self) -> Observer:
-        """The observer of a truck that is not judged by the world alone."""
+        """Observer of a truck that is not judged by the world alone."""
         assert self._observer is not None
         return self._observer
 
@@ -357,7 +359,7 @@ class DrillTruck:
                     task.cancel()
                 observing.cancel()
                 with suppress(asyncio.CancelledError):
-                    await observing  # an observer that broke has seen nothing
+                    await observing  # raises the error of a failed observer
 
     @property
     def gate(self) -> GateState | None:
@@ -374,15 +376,17 @@ class DrillTruck:
         return (*down, *(() if driving else state.hindrances))
 
     async def until(self, condition: Callable[[], bool], seconds: float, order: Order | None = None) -> bool:
-        """Whether the condition becomes true in time; until then the order is repeated while the truck is disarmed.
+        """Return whether the condition becomes true in time; repeat the order while the truck is disarmed.
 
-        An operator who wants to drive resets an emergency stop first: the end of a fault may look like motion.
+        The operator resets an emergency stop before driving, because the end of a fault may look like motion.
         """
         end = self.clock.now() + round(seconds * SECOND)
         while self.clock.now() < end and not self.rig.daemon_ended:
             if condition():
                 return True
-            if order is not None and self.station is not None and self.by_hand:  # a stick at rest, until it is armed
+            if (
+                order is not None and self.station is not None and self.by_hand
+            ):  # a released stick, until the truck is armed
                 self.station.silent = self.gate is None or not self.gate.mode.active
             if order is not None and self.gate is not None and not self.gate.mode.active:
                 await self.order(Order.RESET if self.gate.mode is GateMode.ESTOPPED else order)

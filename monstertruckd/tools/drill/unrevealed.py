@@ -12,14 +12,14 @@ class Unrevealed(NamedTuple):
     """Families with the same explanation."""
 
     families: tuple[str, ...]
-    """Patterns of their names."""
+    """Patterns of the family names."""
     why: str
-    """Reason without a second measure."""
+    """Reason why there is no redundant measurement."""
     limit: str
     """Limit of the effect."""
 
     def holds(self, family: str) -> bool:
-        """Whether it describes a family."""
+        """Whether this entry describes a family."""
         return any(fnmatchcase(family, pattern) for pattern in self.families)
 
 

@@ -1,4 +1,4 @@
-"""Estimates of a log against the stand: odometry, pose in map, tracker; and the stand's latency.
+"""Errors of a log's estimates relative to the stand: odometry, pose in map, tracker; and the stand's latency.
 
 An estimate's frame is aligned with the stand's by least squares of the poses (rotation and translation, no scale). The
 latency is the time shift with the best agreement between the turns of odometry and stand.
@@ -18,7 +18,7 @@ from monstertruck_schemas.topics import ODOMETRY, POSE, STAND_POSE, TRACKER
 from monstertruckd.recorder.reader import LogReader
 
 LEAST_COMMON: Final = 40
-"""Poses in common."""
+"""Minimum number of common poses."""
 
 
 @dataclass(frozen=True)
@@ -28,20 +28,20 @@ class EstimateError:
     what: str
     poses: int
     position_rms: float
-    """m"""
+    """RMS position error (m)"""
     position_end: float
     """Position error at the last pose, with the frames aligned at the first ones (m)"""
     heading_rms: float
-    """rad"""
+    """RMS heading error (rad)"""
     latency: float | None
-    """Delay of the stand's stamps relative to the estimate (s); None: too little turn to determine it"""
+    """Delay of the stand's stamps relative to the estimate (s); None: too little rotation to determine it"""
 
 
 def errors_of(log: LogReader) -> list[EstimateError]:
     """Return the errors of odometry and map pose; of a damaged log up to the damage.
 
     Raises:
-        InputError: it has no poses of a stand, or none of an estimate.
+        InputError: the log has no poses of a stand, or none of an estimate.
     """
     series: dict[str, list[tuple[float, float, float, float]]] = {n.name: [] for n in (STAND_POSE, ODOMETRY, POSE)}
     for entry in log:
@@ -97,10 +97,10 @@ def error_of(what: str, seen: Array, estimate: Array) -> EstimateError:
 def latency_of(seen: Array, estimate: Array) -> float | None:
     """Return the delay of the stand's stamps (s); None if the robot hardly turned."""
     yaw, other = np.unwrap(seen[:, 3]), np.unwrap(estimate[:, 3])
-    if np.ptp(yaw) < 0.5:  # least turn to determine the latency, rad
+    if np.ptp(yaw) < 0.5:  # minimum rotation to determine the latency, rad
         return None
     times = seen[:, 0]
-    reach = 0.5  # greatest latency, s
+    reach = 0.5  # maximum latency, s
     inside = (times > estimate[0, 0] + reach) & (times < estimate[-1, 0] - reach)
     if inside.sum() < LEAST_COMMON:
         return None

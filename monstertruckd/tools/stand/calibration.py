@@ -27,7 +27,7 @@ from monstertruckd.tools.stand.config import MarkConfig, OverheadConfig
 Numbers = Annotated[tuple[float, ...], Field(strict=False)]
 
 LEAST_MARKS: Final = 5
-"""Marks that a camera must see, at least."""
+"""Minimum number of marks that a camera must see."""
 
 
 class CameraCalibration(Schema):
@@ -54,7 +54,7 @@ class StandCalibration(Schema):
     version: Literal[1] = 1
     cameras: dict[str, CameraCalibration]
     overlap_rms: float | None
-    """RMS difference between cameras of a mark that several see (m); None: no mark is seen by two"""
+    """RMS difference between cameras for marks that several see (m); None: no mark is seen by two"""
 
     def placed(self) -> dict[str, PlacedCamera]:
         """Return the cameras with their poses."""
@@ -100,12 +100,13 @@ def check_places(
         placed: camera, placed by all of its marks.
         seen: centres of its marks (pixels).
         marks: marks by tag.
-        ruler: standard deviation of a mark's place (m).
+        ruler: standard deviation of a mark's position (m).
 
     Raises:
-        InputError: a mark is elsewhere; names the mark whose removal makes the others fit, else the three worst.
+        InputError: a mark is elsewhere; the text names the mark whose removal makes the others fit, otherwise the three
+            worst.
     """
-    # maximum error of a mark's place, m, and in standard deviations of the ruler
+    # maximum error of a mark's position, m, and in standard deviations of the ruler
     misplaced = (0.002, 5.0)
     limit = misplaced[0] + misplaced[1] * ruler
 
@@ -142,7 +143,7 @@ def join(
         cameras: cameras placed one by one.
         seen: centres of marks by camera (pixels).
         marks: marks by tag.
-        ruler: standard deviation of a mark's place (m).
+        ruler: standard deviation of a mark's position (m).
     """
     names = list(cameras)
     rays = {n: {tag: cameras[n].lens.directions(px[None])[0] for tag, px in seen[n].items()} for n in names}
@@ -162,7 +163,7 @@ def join(
         off: list[Array] = []
         for tag, points in by_tag.items():
             middle = np.mean(points, axis=0)
-            # 0.0005: standard deviation of a point on the table by a camera's noise, m: a fifth of a pixel
+            # 0.0005: standard deviation of a point on the table by camera noise, m: a fifth of a pixel
             off += [(point - middle) / 0.0005 for point in points] if len(points) > 1 else []
             off.append((middle - (marks[tag].x, marks[tag].y)) / ruler)
         return np.concatenate(off)
@@ -192,7 +193,7 @@ def calibrate(
     for name in config.cameras:
         try:
             lenses[name] = lens_from_pictures(boards[name], BoardReader(config.board))
-            # What else has a tag, such as a robot that stands there, may be above the table.
+            # Other objects with a tag, such as a robot on the table, may be above its plane.
             seen[name] = {tag: px for tag, px in seen_marks(floors[name]).items() if tag in config.marks}
             placed[name] = place(lenses[name][0].lens, seen[name], config.marks)
             check_places(placed[name], seen[name], config.marks, config.ruler_error)
@@ -239,7 +240,7 @@ def save(calibration: StandCalibration, path: Path) -> None:
     """Write the calibration file atomically.
 
     Raises:
-        ConfigError: it cannot be written.
+        ConfigError: the file cannot be written.
     """
     try:
         make_folder(path.parent)

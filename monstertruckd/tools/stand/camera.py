@@ -16,9 +16,9 @@ class PlacedCamera:
 
     lens: Lens
     rotation: Array
-    """(3,): rotation vector from the stand's to the camera's axes (rad)."""
+    """Rotation vector from the stand's to the camera's axes, (3,) (rad)."""
     translation: Array
-    """(3,): the stand's origin as the camera has it (m)."""
+    """The stand's origin in the camera frame, (3,) (m)."""
 
     @cached_property
     def axes(self) -> Array:

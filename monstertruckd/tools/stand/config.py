@@ -15,7 +15,7 @@ class VideoDevice(Schema):
 
     kind: Literal["v4l2"] = "v4l2"
     device: Path
-    """/dev/video0, or better a link by path"""
+    """Device node: /dev/video0, or preferably a link by path"""
 
 
 class FileSource(Schema):
@@ -34,13 +34,13 @@ class RenderedCamera(Schema):
 
 
 class StandCamera(Schema):
-    """One camera over the table."""
+    """One camera above the table."""
 
     source: Annotated[VideoDevice | FileSource | RenderedCamera, Field(discriminator="kind")]
     boards: Path
-    """Folder with pictures of the board, held anyhow: for the lens"""
+    """Folder with pictures of the hand-held board, for the lens"""
     floor: Path
-    """Folder with pictures of the table with its marks: for the camera's place"""
+    """Folder with pictures of the table and its marks, for the camera's pose"""
 
 
 class MarkConfig(Schema):
@@ -60,7 +60,7 @@ class MarkedRobot(Schema):
     yaw: float = 0.0
     """Yaw of the marker relative to the robot, left positive (rad)"""
     height: Annotated[float, Field(ge=0, le=2)] = 0.08
-    """Height of the marker over the table (m)"""
+    """Height of the marker above the table (m)"""
 
 
 class TaggedRobot(MarkedRobot):
@@ -75,9 +75,9 @@ class BlobRobot(MarkedRobot):
     front: Colour
     rear: Colour
     apart: Annotated[float, Field(gt=0.03, le=1)]
-    """Distance of the discs' middles (m)"""
+    """Distance between the discs' centres (m)"""
     start: Annotated[tuple[float, float] | None, Field(strict=False)] = None
-    """Its place at the start (m): for robots that look like others"""
+    """Start position (m), for robots that look like others"""
 
     @model_validator(mode="after")
     def _two_colours(self) -> Self:
@@ -101,24 +101,24 @@ class OverheadConfig(Schema):
     size: tuple[int, int] = Field((640, 480), strict=False)
     """Width and height of the pictures (pixels)"""
     rate: Annotated[float, Field(gt=0, le=120)] = 25.0
-    """Pictures a second"""
+    """Picture rate (Hz)"""
     board: BoardConfig = BoardConfig()
     marks: dict[int, MarkConfig]
-    """Tags on the table by number: five in sight of each camera, or more"""
+    """Tags on the table by number; each camera must see at least five"""
     mark_size: Metres = 0.08
     """Side of the black square of tags on the table (m)"""
     ruler_error: Annotated[float, Field(gt=0, le=0.1)] = 0.0015
-    """Standard deviation of a mark's place (m)"""
+    """Standard deviation of a mark's measured position (m)"""
     robots: dict[Name, TaggedRobot] = {}
     """Robots with tags"""
     blobs: dict[Name, BlobRobot] = {}
     """Robots with coloured discs"""
     calibration: Path = Path("runs/stand/calibration.json")
-    """Written by `stand calibrate`"""
+    """Calibration file written by `stand calibrate`"""
 
     @property
     def names(self) -> list[str]:
-        """Tags of all robots."""
+        """Names of all robots."""
         return [*self.robots, *self.blobs]
 
     @property

@@ -20,19 +20,19 @@ from monstertruckd.tools.stand.config import BlobRobot
 from monstertruckd.tools.stand.poses import MarkerPose, weight_of
 
 AT_START: Final = 0.15
-"""Maximum distance from its start to identify a robot that looks like others (m)."""
+"""Maximum distance from its start position to identify a robot that looks like others (m)."""
 UNSURE: Final = 0.5
 """Maximum time out of sight before robots that look the same may be confused (s)."""
 
 
 class Pair(NamedTuple):
-    """Two discs that may be a robot."""
+    """Two discs that may belong to a robot."""
 
     front: int
     rear: int
     pose: MarkerPose
     off: float
-    """Difference between their distance and the robot's distance of discs (m)."""
+    """Difference between their distance and the robot's disc distance (m)."""
 
 
 @dataclass(slots=True)
@@ -160,10 +160,10 @@ def pairs(camera: PlacedCamera, robot: BlobRobot, blobs: Sequence[Blob]) -> Iter
                 continue
             ahead = points[i] - points[j]
             apart = float(np.hypot(*ahead))
-            if abs(apart - robot.apart) > 0.012:  # tolerated error of the distance of two discs, m
+            if abs(apart - robot.apart) > 0.012:  # tolerance of the distance of two discs, m
                 continue
             x, y = (points[i] + points[j]) / 2
-            # 0.1: standard deviation of a disc's middle, pixels
+            # 0.1: standard deviation of a disc's centre, pixels
             sigma = 0.1 * apart / float(np.hypot(*(pixels[i] - pixels[j])))
             yield Pair(
                 i,

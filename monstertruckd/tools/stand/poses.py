@@ -18,7 +18,7 @@ class MarkerPose(NamedTuple):
     x: float
     y: float
     yaw: float
-    """Direction from the middle to a tag's printed upper edge, or to the front disc (rad)."""
+    """Direction from the centre to a tag's printed upper edge, or to the front disc (rad)."""
     weight: float
     sigma: float
     """Standard deviation of x and y (m)."""
@@ -28,7 +28,7 @@ class MarkerPose(NamedTuple):
 
 
 class RobotPose(NamedTuple):
-    """A robot on the stand."""
+    """Pose of a robot on the stand."""
 
     robot: str
     stamp: int

@@ -25,7 +25,7 @@ ENDINGS: Final = (".png", ".jpg", ".jpeg", ".pgm")
 
 
 FLAGS: Final = {False: cv2.IMREAD_GRAYSCALE, True: cv2.IMREAD_COLOR}
-"""Flags of OpenCV's readers, by whether there is colour."""
+"""Flags of OpenCV's readers, for grey (False) and colour (True)."""
 
 
 def pictures_in(folder: Path) -> list[Picture]:
@@ -80,7 +80,7 @@ def _rendered(port: Path, mode: Mode, *, colour: bool) -> Iterator[Picture]:
     """Yield images of an emulated camera; each request returns the latest."""
     box: queue.Queue[bytes | BaseException] = queue.Queue(1)
     ended = threading.Event()
-    # A separate thread reads continuously: a pty keeps 4 kB.
+    # A separate thread reads continuously, because a pty buffers only 4 kB.
     reading = threading.Thread(target=_read_port, args=(port, mode, box, ended), name=f"camera {port}", daemon=True)
     reading.start()
     try:
@@ -104,7 +104,7 @@ def _read_port(port: Path, mode: Mode, box: "queue.Queue[bytes | BaseException]"
     async def read() -> None:
         async with await RenderedSource(SerialPort(port), WallClock()).open(mode, buffers=2) as stream:
             while not ended.is_set():
-                with suppress(ValueError):  # cut off
+                with suppress(ValueError):  # truncated
                     put(complete((await stream.next()).data))
 
     try:

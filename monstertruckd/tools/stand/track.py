@@ -57,7 +57,7 @@ class StandReader:
 
 
 class StandRun:
-    """Tracks until its sources end, or it is cancelled.
+    """Tracks until the sources end or until cancelled.
 
     Args:
         tracker: tracker of robots and cameras.
@@ -170,4 +170,4 @@ class StandRun:
                     said = str(error)
                     with suppress(RuntimeError):  # the loop has ended
                         loop.call_soon_threadsafe(self._say, f"camera {name}: {error}")
-            self._ended.wait(1.0)  # seconds before a lost camera is tried again
+            self._ended.wait(1.0)  # seconds before a lost camera is reopened

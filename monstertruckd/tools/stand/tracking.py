@@ -24,16 +24,16 @@ from monstertruckd.tools.stand.identities import Identities
 from monstertruckd.tools.stand.poses import MarkerPose, RobotPose, merged, robot_pose, tag_pose
 
 EXPECTED: Final = 0.5
-"""Time that a robot's motion is extrapolated (s)."""
+"""Time over which a robot's motion is extrapolated (s)."""
 BLIND: Final = 5.0
-"""Maximum time without a mark before a camera counts as moved (s)."""
+"""Maximum time without a mark before a camera is considered moved (s)."""
 
 
 @dataclass(slots=True)
 class _Known:
     pose: RobotPose
     side: float
-    """Side of its tag (m)."""
+    """Side of the tag (m)."""
     doubts: int = 0
     rate: Array = field(default_factory=lambda: np.zeros(3))
     """Rates of x, y and yaw (m/s, rad/s)."""
@@ -51,9 +51,9 @@ class CameraState:
     heard: int
     """Stamp of its latest picture (ns)."""
     marked: int
-    """Stamp of the latest one with marks (ns)."""
+    """Stamp of its latest picture with marks (ns)."""
     unmarked: int = 0
-    """Pictures since."""
+    """Number of pictures since then."""
     off: Array = field(default_factory=lambda: np.zeros(4))
     """Smoothed `shift_of` its marks (m)."""
     lost: bool = False
@@ -61,7 +61,7 @@ class CameraState:
 
     @property
     def distance(self) -> float:
-        """Error of its marks (m)."""
+        """Position error of its marks (m)."""
         return float(np.sqrt(self.off @ self.off))
 
 
@@ -83,7 +83,7 @@ def shift_of(seen: Array, places: Array) -> Array:
 
 
 class StandTracker:
-    """Poses of all robots, and the state of the cameras.
+    """Tracks the poses of all robots and the state of the cameras.
 
     Args:
         cameras: cameras with their poses.
@@ -110,7 +110,7 @@ class StandTracker:
         self._known: dict[str, _Known] = {}
         self.cameras = {name: CameraState(now, now) for name in cameras}
         self.left_out = 0
-        """Impossible poses."""
+        """Number of impossible poses dropped."""
 
     def take(
         self,
@@ -217,9 +217,7 @@ class StandTracker:
             return True
         seconds = (pose.stamp - known.pose.stamp) / SECOND
         jump = math.hypot(pose.x - known.pose.x, pose.y - known.pose.y)
-        # 3.0: greatest speed of a robot, m/s
-        # 0.05: maximum change that is not a jump, m
-        # 5: pictures before an impossible pose is accepted
+        # 3.0: maximum speed of a robot, m/s
         if jump > 3.0 * max(seconds, 0.0) + 0.05 and known.doubts < 5:
             known.doubts += 1
             self.left_out += 1
@@ -229,8 +227,7 @@ class StandTracker:
             known.rate = np.zeros(3)
         elif seconds > 0.0:
             moved = np.array((pose.x - known.pose.x, pose.y - known.pose.y, turn))
-            # A mean over time: two cameras place a robot at rest some 1 mm apart, at instants of 1 ms between.
-            # 0.1: seconds over which a robot's speed is a mean
+            # Average over time: two cameras differ by about 1 mm for a robot at rest, at times 1 ms apart.
             known.rate = known.rate - math.expm1(-seconds / 0.1) * (moved / seconds - known.rate)
         known.pose, known.side, known.doubts = pose, side, 0
         return True
@@ -246,5 +243,5 @@ class StandTracker:
         state.marked, state.unmarked = stamp, 0
         points = np.array([camera.on_plane(sighting.corners).mean(axis=0) for sighting in seen])
         places = np.array([(self.marks[s.tag].x, self.marks[s.tag].y) for s in seen])
-        share = 1.0 - math.exp(-min(max(seconds, 0.0), 1.0) / 3.0)  # seconds over which that is averaged
+        share = 1.0 - math.exp(-min(max(seconds, 0.0), 1.0) / 3.0)  # time constant of this average (s)
         state.off = state.off + share * (shift_of(points, places) - state.off)
