@@ -39,10 +39,10 @@ class Approach:
         self.emergency = False
         """Whether an obstacle is so near that only the quick stop avoids contact."""
         self.free: float | None = None
-        """Distance the footprint can travel, m; None without an obstacle within the distance checked."""
+        """Distance the footprint can travel, m; None without an obstacle within the checked distance."""
 
     def forget(self) -> None:
-        """Reset, because no source drives."""
+        """Reset the state when no source drives."""
         self.blocked = self.emergency = False
         self.free = None
 

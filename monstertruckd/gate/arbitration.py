@@ -58,7 +58,9 @@ class Source:
     inside: bool
     """Whether the source is a planner of the robot."""
     held: bool = False
-    """Whether the source must send a neutral request before it may drive."""
+    """Sources that were live at the STOP order or have been neutral since, least recent first; None without a STOP
+    order.
+    """
 
     @property
     def key(self) -> Key:
@@ -135,7 +137,7 @@ class Sources:
         return reason
 
     def stopped(self, source: str, now: int) -> None:
-        """Note a stop ordered by a source; refuse starting orders of other sources that did not know of it.
+        """Record a stop ordered by a source; refuse starting orders of other sources that did not know of it.
 
         Args:
             source: name of the source; empty if not authenticated, which differs from every source.
@@ -188,7 +190,7 @@ class Sources:
         return max(able, key=lambda source: (source.rank, source.requests_motion, source.key == holder), default=None)
 
     def ask(self, name: str, now: int) -> None:
-        """Note that an operator asks for the drive."""
+        """Record that an operator asks for the drive."""
         self._asking = {other: until for other, until in self._asking.items() if now <= until and other != name}
         while len(self._asking) >= 4:  # maximum number of operators who ask at once; one more replaces the oldest
             del self._asking[next(iter(self._asking))]
@@ -223,7 +225,7 @@ class Sources:
         return self._handed is not None and source.rank <= self._handed[2]
 
     def priority(self, source: Source, now: int, holder: Key | None) -> Reason:
-        """Return OK if this source drives or would drive, else the reason."""
+        """Return OK if this source drives or would drive, otherwise the reason."""
         if source.held:
             return Reason.NOT_ARMED_SPEED
         driver = self.driver(now, holder)

@@ -1,6 +1,6 @@
 """Assisted driving: turns an operator's motion to the nearest curvature whose swept ground is free.
 
-It never increases the operator's speed, and never changes a request for standstill. All checks of the gate see the
+It never increases the operator's speed, and never changes a request for standstill. All checks of the gate treat the
 turned motion as if the operator had requested it.
 """
 
@@ -37,9 +37,9 @@ def nearest_free(turns: Array, free: Array, needed: float) -> float:
 
 
 def free_distances(twists: Array, footprint: Footprint, margin: float, points: Array) -> Array:
-    """Return how far a body gets on the arcs of constant twists before it touches a point, +inf if it never does.
+    """Return the distance a body can travel on the arcs of constant twists before it touches a point; +inf if never.
 
-    Discs cover the footprint. A point inside of a disc counts if the disc moves towards it.
+    Discs cover the footprint. A point inside a disc counts only if the disc moves towards it.
 
     Args:
         twists: vx, vy, wz of the base per metre travelled, shape (k, 3).
@@ -80,7 +80,7 @@ def free_distances(twists: Array, footprint: Footprint, margin: float, points: A
 
 
 class Assist(Check):
-    """Turns the requests of operators while ``gate.assist.on``; as a check, it shows when it does.
+    """Turns the requests of operators while ``gate.assist.on``; as a check, it reports when it does so.
 
     Args:
         view: limits, samples and motion.
@@ -124,7 +124,7 @@ class Assist(Check):
         return request.model_copy(update={"front": front, "rear": rear}) if self._turned else request
 
     def _choose(self, request: DriveRequest, now: int) -> float:
-        """Return the additional turn of each axle compared with the request (rad)."""
+        """Return the turn to add to each requested axle angle (rad)."""
         config, bicycle = self.view.config, self.view.chassis.bicycle
         # Both ends turn the axles to their limit, whatever the request.
         most = config.angle + max(abs(request.front), abs(request.rear))
@@ -141,7 +141,7 @@ class Assist(Check):
         return nearest_free(turns, free_distances(np.array(twists), footprint, margin, points), needed)
 
     def _axles(self, request: DriveRequest, turn: float) -> tuple[float, float]:
-        """Return the asked axle angles, each turned further to one side, within the limits."""
+        """Return the requested axle angles, each turned further to one side, within the limits."""
         most, chassis = self.view.config.angle, self.view.chassis
         front = min(max(request.front + turn, -most), most)
         if chassis.freedom != "both":

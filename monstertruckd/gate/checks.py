@@ -2,8 +2,9 @@
 
 The gate keeps an ordered list of checks, worst reasons first. Every check observes all messages received by the gate
 and every tick (``observe``). At each tick the gate asks it why the robot may not move at all (``reason``) and how fast
-it may go along the requested and commanded motions (``limit``); ``describe`` words a reason with its measurements. The
-gate combines the union of all reasons and the minimum of all limits, so an additional check can only make it stricter.
+it may go along the requested and commanded motions (``limit``); ``describe`` explains a reason with its measurements.
+The gate combines the union of all reasons and the minimum of all limits, so an additional check can only make it
+stricter.
 """
 
 import math
@@ -181,7 +182,7 @@ class Check:
         return False
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
-        """Take a message or the start of a tick; ``view.samples`` already holds the message if it is valid.
+        """Process a message or the start of a tick; ``view.samples`` already holds the message if it is valid.
 
         Args:
             seen: message or tick.

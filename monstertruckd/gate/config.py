@@ -89,7 +89,7 @@ class AssistConfig(Schema):
     """Assisted driving: an operator's motion is turned to the nearest curvature whose swept ground is free."""
 
     on: Annotated[bool, LIVE] = False
-    """Steer round obstacles; the operator's speed is never raised"""
+    """Whether assisted driving steers around obstacles; it never increases the operator's speed"""
     horizon: LivePositive = 0.6
     """Distance kept free beyond the stopping distance, m."""
 
@@ -106,8 +106,9 @@ class ObstacleLimits(Schema):
     crawl: Positive = 0.02
     """Allowed speed below which the truck stops, m/s; it continues when twice this speed is allowed."""
     seen: Annotated[float, Field(gt=0, le=1)] = 0.5
-    """Minimum fraction of the beams in each sector of travel (10 degrees) that measure a range, or meet nothing within
-    the lidar's range. A recorded URG-04LX has 0.95 to 1.0, and less than half in one of 800 sectors."""
+    """Minimum fraction of the beams in each sector of travel (10 degrees) that have a range, or no return within the
+    lidar's range. A recorded URG-04LX has 0.95 to 1.0, and less than half in one of 800 sectors.
+    """
     unseen_speed: LivePositive = 0.1
     """Speed limit while a sector of travel is not seen, m/s; a sector not seen for ``scan.stale_after`` stops the
     truck. Also the limit for a body that turns on the spot or swings its tail onto ground not seen recently by any
@@ -203,7 +204,9 @@ class GateConfig(Schema):
     speed: LivePositive = 0.21
     """Maximum wheel speed over ground, forward, m/s."""
     reverse_speed: LivePositive = 0.15
-    """Maximum wheel speed in other motions (reverse, sideways, on the spot), m/s: the lidar does not see it all."""
+    """Maximum wheel speed in other motions (reverse, sideways, on the spot), m/s: the lidar does not cover all of
+    them.
+    """
     angle: Annotated[float, Field(gt=0, lt=1.0), LIVE] = 0.436
     """Maximum axle angle, rad; less if the servos' pulses reach less."""
     acceleration: LivePositive = 0.5
@@ -541,7 +544,7 @@ def weaker(section: str, config: Schema, usual: Schema, above: Iterable[str], be
 
 
 def _value(config: Schema, name: str) -> Any:
-    """A setting by its dotted name; None if its section is off."""
+    """Return a setting by its dotted name; None if its section is off."""
     found: Any = config
     for part in name.split("."):
         found = None if found is None else getattr(found, part)

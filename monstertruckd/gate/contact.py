@@ -1,10 +1,11 @@
 """Detects contact while an operator drives into ground that no lidar has seen, and backs off.
 
 Four measures show that an obstacle holds the body while its wheels are driven: a motor draws more than its rolling
-current, a shaft or a free wheel is slower than commanded, the body turns less than commanded, or the scans show a body
-that stands while its wheels roll. The gate compares them only while the commanded motion is steady, because a motor
-that accelerates its gears draws as much current as a motor that pushes. After a contact the gate reverses the last
-motion for a few centimetres. Then the robot stands until the operator releases the stick or requests another direction.
+current, a shaft or a free wheel is slower than commanded, the body turns less than commanded, or the scans show that
+the body stands still while its wheels roll. The gate compares them only while the commanded motion is steady, because a
+motor that accelerates its gears draws as much current as a motor that pushes. After a contact the gate reverses the
+last motion for a few centimetres. Then the robot stands until the operator releases the stick or requests another
+direction.
 """
 
 import math
@@ -245,7 +246,7 @@ class ContactCheck(Check):
             self._touch(ContactFinding(f"speed of {name}", measured, unit, least), seen.received)
 
     def _touch(self, found: ContactFinding, now: int) -> None:
-        """Begin to back off if the robot drives on into unseen ground, or near a dock, and not already away from it."""
+        """Begin to back off if the robot drives into unseen ground or near a dock, but not away from the contact."""
         view = self.view
         blind = view.operated and not view.samples.scan_fresh(now)
         if (
@@ -259,10 +260,10 @@ class ContactCheck(Check):
 
 
 def _current_limit(rolling: Sequence[float], rise: float, step: float) -> float:
-    """Return the current above the rolling currents (A) by more than a share of them, ``rise``, and than their noise.
+    """Return the current limit (A): the rolling current plus the fraction ``rise`` of it, and plus its noise.
 
-    Downhill a motor rolls with hardly any current, or brakes: there the noise decides. Readings of 0 hide noise below
-    half their resolution, ``step`` (A), so its rounding error counts as noise.
+    Downhill, the motor draws hardly any current, or brakes, so that the noise determines the limit. Readings of 0 hide
+    noise below half their resolution, ``step`` (A), so its rounding error counts as noise.
     """
     usual, noise, sigmas = median(rolling), pstdev(rolling), 5.0  # significance
     if not usual:

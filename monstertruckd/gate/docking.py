@@ -1,4 +1,4 @@
-"""Dock check: lets the robot come near a dock, slowly, while a behaviour docks or undocks.
+"""Dock check: permits a slow approach to a dock while a behaviour docks or undocks.
 
 The gate knows the docks of the configuration: places, housings and staging distances. The behaviour reports the exact
 pose of a dock in ``plan/behaviour``; the gate accepts it only within these bounds:
@@ -7,8 +7,8 @@ pose of a dock in ``plan/behaviour``; the gate accepts it only within these boun
 - the robot is localised on the map, and the dock is within 0.3 m and 0.3 rad of its place there;
 - the robot stands on the axis of the dock: at most ``docking.across`` to either side, ``docking.turn`` off it, not
   further out than the staging pose, and no more than ``docking.beyond`` past the docked pose. A robot that docks in
-  reverse also looks at the dock, and backs off to turn about: either end may face the dock, as far as ``turning``
-  beyond staging.
+  reverse first faces the dock, and then backs off to turn around: either end may face the dock, up to ``turning``
+  beyond the staging pose.
 
 Within them the pace is at most ``docking.speed``, lidar returns inside the housing are ignored, and the corridor of a
 robot within these bounds counts as seen ground. All other rules stay in force, and contact is detected as
@@ -43,12 +43,7 @@ FRESH: Final = SECOND
 
 
 class DockCheck(Check):
-    """Finds the area of the dock that the robot is near, and limits the speed there.
-
-    Args:
-        view: read access to the gate's state.
-        docks: docks of the configuration, by name.
-    """
+    """Finds the dock area near the robot, and limits the speed there."""
 
     reasons = (Reason.DOCKING,)
     reads = (ODOMETRY, BEHAVIOUR, POSE, SLAM)
@@ -98,7 +93,7 @@ class DockCheck(Check):
         inside = -far - limits.across <= x <= limits.beyond
         if not inside or abs(y) > limits.across or abs(turn) > limits.turn:
             return None
-        # A scan shows the dock from where the robot was at its stamp.
+        # A scan shows the dock from the robot's pose at its stamp.
         stamps = np.array([sample.stamp for sample in self._trail])
         poses = np.array([_base(sample) for sample in self._trail])
         there = interpolate(stamps, poses, np.array([min(scan.stamp, scan.received)]))[0]
@@ -106,20 +101,20 @@ class DockCheck(Check):
         body = self.view.footprint
         end = body.length / 2
         side = limits.across + body.half_length * math.sin(limits.turn) + body.half_width * math.cos(limits.turn)
-        # Past ``beyond`` there is no area. 0.03: noise of lidar returns before the housing, m
+        # Past ``beyond`` there is no area. 0.03: noise of lidar returns in front of the housing, m
         box = dock.housing
         housing = None if box is None else (end - 0.03, end + box.depth, box.width / 2)
         return DockArea((at_x, at_y, yaw), (-far - limits.across - end, math.inf, side), housing)
 
     def _place(self, now: int) -> Array | None:
-        """Base in map, shape (3,); None if it is old or not known."""
+        """Return base in map, shape (3,); None if the pose is old or unknown."""
         located = self._located
         if located is None or now - located.received > POSE.fresh_for() * SECOND or placeless(self._slam):
             return None
         return _base(located)
 
     def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
-        """Limit of the pace near the dock."""
+        """Limit the pace near the dock."""
         if courses and self.view.dock is not None:
             speed = self.view.config.docking.speed
             if speed < max(pace for _, pace in courses):
@@ -127,9 +122,9 @@ class DockCheck(Check):
 
 
 def _agree(reported: Array, dock: DockConfig) -> bool:
-    """Whether a reported dock, in map, is where the configuration has it."""
+    """Return whether a reported dock, in map, agrees with its configured pose."""
     x, y, turn = between(facing(np.array((dock.x, dock.y, dock.yaw)), dock), reported).tolist()
-    off = 0.3  # m and rad: localisation, and the place as it was entered
+    off = 0.3  # m and rad: errors of the localisation and of the configured pose
     return math.hypot(x, y) <= off and abs(turn) <= off
 
 

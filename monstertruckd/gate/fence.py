@@ -23,7 +23,7 @@ from monstertruckd.gate.obstacles import OUTLINE, at_poses
 
 
 class FenceCheck(Check):
-    """Stops the robot before more of its outline leaves the fence; a robot outside may come back.
+    """Stops the robot before more of its outline leaves the fence; a robot outside may return.
 
     Args:
         config: the fence.

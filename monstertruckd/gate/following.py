@@ -28,7 +28,7 @@ class Comparison(Protocol):
         """Whether the measurements contradict the commands."""
 
     def reset(self) -> None:
-        """Start over."""
+        """Restart the comparison."""
 
 
 C = TypeVar("C", bound=Comparison)
@@ -127,7 +127,7 @@ class TurnComparison:
         """Measured minus commanded turn over the window, rad."""
 
     def reset(self) -> None:
-        """Start over."""
+        """Restart the comparison."""
         self._window.clear()
         self.contradicts = False
         self.difference = 0.0
@@ -201,7 +201,7 @@ class ShaftComparison:
         return self.blocked is not None
 
     def reset(self) -> None:
-        """Start over."""
+        """Restart the comparison."""
         self._since.clear()
         self.blocked = None
 

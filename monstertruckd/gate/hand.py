@@ -4,8 +4,8 @@
   armed it. Switching it from off to on is the order to arm.
 - While the arm switch and the drive switch (if fitted) are on, the sticks drive.
 - While the emergency stop switch is on, the robot stays emergency-stopped, even if another operator resets it.
-- Loss of the transmitter stops and disarms the robot, whichever source drives. After its return the arm switch must be
-  seen off before it can arm the robot.
+- Loss of the transmitter stops and disarms the robot, whichever source drives. After reconnection, the arm switch must
+  be off once before it can arm the robot.
 """
 
 import secrets
@@ -154,10 +154,10 @@ class HandService:
         self._instance = secrets.token_hex(8)
         self._seq = 0
         self._lost: str | None = ""
-        """Why the radio control was lost, as reported; None if it was reported to be there."""
+        """Reported reason of the loss; None if the radio control was reported as connected."""
 
     async def run(self, ready: Ready) -> None:
-        """Turn receiver messages into requests until cancelled."""
+        """Convert receiver messages into requests until cancelled."""
         schedule = Schedule(self._clock, 20.0)  # requests per second
         while True:
             await schedule.next()

@@ -206,13 +206,13 @@ class ObstacleGuard:
             self._checked = None
 
     def hear(self, ranges: SonarRanges) -> None:
-        """Take a round of pings."""
+        """Process a round of pings."""
         for ping in self._sonars.pings(ranges):
             self.memory.hear(*ping)
             self._checked = None
 
     def observe(self, scan: LaserScan, lidar: int = 0) -> None:
-        """Take a scan of a lidar, by its number."""
+        """Process a scan of a lidar, given by its number."""
         eye = self._eyes[lidar]
         points = eye.measured = eye.scan_points.of(scan)
         eye.visibility.observe(scan, points)
@@ -299,8 +299,8 @@ class ObstacleGuard:
             measured: measured points in base, shape (n, 2), m.
         """
         self.known = self.known_slowly = math.inf
-        # A turn on the spot must not cover unseen ground nearer than this to a measured point, m: an obstacle there
-        # is seen from one side only. A standing person is about this deep.
+        # A turn on the spot must not cover unseen ground nearer than this to a measured point, m: an obstacle there is
+        # visible from one side only. A standing person is about this deep.
         depth = 0.2
         # In a motion ahead the tail must not swing onto unseen ground if a measured point is at most this far in front
         # of it and to its side, m: a wall along the body leaves the field of view this far in front of the tail.
@@ -340,7 +340,7 @@ class ObstacleGuard:
         return unknown
 
     def _further(self, twist: _Steps, known: float) -> float:
-        """Distance beyond ``known`` that stays on seen ground, m; less than the distance between two ground checks."""
+        """Return the distance beyond ``known`` that stays on seen ground, m; less than the spacing of ground checks."""
         x, y, turn = (part * TWIST_STEP for part in twist)
         finer = 4  # parts of the distance between two ground checks; resolution of the edge of seen ground
         step = GROUND_STEP * float(self._sweep(*twist).distances[1]) / finer
@@ -507,5 +507,5 @@ def _is_sideways(twist: _Steps, body: Footprint) -> bool:
 
 
 def _finite(value: float) -> float | None:
-    """The value, or None if infinite."""
+    """Return the value, or None if it is infinite."""
     return value if math.isfinite(value) else None

@@ -1,7 +1,7 @@
 """Rear-facing sonars of a robot with a lidar: view of the ground behind it.
 
 An echo shows that the ground within the cone is free up to the measured range, and that an obstacle stands on the arc
-at that range. A ping without an echo shows nothing: a surface may have reflected the sound elsewhere.
+at that range. A ping without an echo carries no information, because a surface may have reflected the sound elsewhere.
 """
 
 import math

@@ -545,7 +545,7 @@ class RunawayCheck(Check):
 
     @property
     def moves(self) -> bool:
-        """Whether a motor turns a shaft, or the body."""
+        """Whether a motor turns a shaft or moves the body."""
         return any(watch.moves and watch.driven for watch in self._shafts) or self._body_moves
 
     @property
@@ -568,7 +568,7 @@ class RunawayCheck(Check):
         return self._step >= Escalation.PORT_OFF
 
     def text(self, reason: Reason) -> str:
-        """The motion, and the step taken against it."""
+        """Return the motion, and the step taken against it."""
         found = self._found
         if found is None:
             return reason.text

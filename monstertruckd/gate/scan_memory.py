@@ -18,9 +18,10 @@ from monstertruck_schemas.base import position_deviation
 from monstertruck_schemas.sensor import HIDDEN, NO_ECHO, VALID_BEAM, LaserScan
 
 DRIFT: Final = 0.03
-"""Ground this near to a place where the body stood counts as free, m: the error of dead reckoning. The distance shrinks
-by the part of the growth of the pose's standard deviation since then that exceeds the padding of the footprint. A
-moving body has no such margin: its tail would swing further with each scan."""
+"""Margin around past positions of the body within which ground counts as free, m: the error of dead reckoning. As the
+pose's standard deviation grows since then, its growth beyond the padding of the footprint reduces the margin. A moving
+body has no margin: its tail would swing further with each scan.
+"""
 STANDING: Final = 0.001
 """Distance travelled between two scans below which the body stands, m: rounding of its velocity."""
 MAP_SIZE: Final = 64
@@ -83,7 +84,7 @@ class _Taken(NamedTuple):
     variance: float
     """Variance of the pose in odometry when it was taken, m^2."""
     beside: float = DRIFT
-    """Ground this near to the body counts as free, m."""
+    """Margin around the body within which ground counts as free, m."""
 
 
 class _LidarMemory:
@@ -195,7 +196,7 @@ class ScanMemory:
         eye = self._eyes[lidar]
         self._newest = eye.newest = self._take(Beams.of(scan), spaced(points, spacing), eye.mount)
         travelled, taken = self._newest.travelled, eye.taken
-        # The view of a standing body does not age; points of its first scan there may be out of sight by now.
+        # The view of a body at rest does not age, but points of its first scan may be out of sight by now.
         stood = [travelled - scan.travelled < STANDING for scan in list(taken)[-2:]]
         memory_step = 0.1  # distance travelled between two remembered scans, m
         if stood == [True, True]:

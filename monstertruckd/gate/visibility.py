@@ -1,4 +1,4 @@
-"""View of the lidar: a beam without a range may mean free ground, or a covered or dazzled sensor."""
+"""Field of view of a lidar: a beam without a range may mean free ground, or a covered or dazzled sensor."""
 
 import math
 from collections.abc import Sequence
@@ -20,13 +20,13 @@ Sectors = NDArray[np.intp]
 class Visibility:
     """When each sector around the lidar was last seen.
 
-    A beam sees if it measured a range that ends outside the body, or met nothing within the sensor's range. A sector
-    is seen if a share of its beams sees: single beams fail on edges and dark surfaces.
+    A beam is valid if its range ends outside the body, or if it has no return within the sensor's range. A sector is
+    seen if enough of its beams are valid, because single beams fail on edges and dark surfaces.
 
     Args:
         footprint: the body's outline.
         mount: pose (x, y, yaw) of the lidar in base, m, m, rad.
-        share: fraction of a sector's beams that must see, 0..1.
+        share: minimum fraction of valid beams in a seen sector, 0..1.
     """
 
     def __init__(self, footprint: Footprint, mount: tuple[float, float, float], share: float) -> None:

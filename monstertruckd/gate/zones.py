@@ -1,4 +1,4 @@
-"""Zone check: keeps the footprint out of keepout zones, and slow on speed zones."""
+"""Zone check: keeps the footprint out of keepout zones, and limits the speed in speed zones."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -37,10 +37,10 @@ def entry_speed(room: float, delay: float, deceleration: float, limit: float) ->
 
 
 class ZoneCheck(Check):
-    """Stops the robot before and inside keepout zones, and limits its speed on speed zones.
+    """Stops the robot before and inside keepout zones, and limits its speed in speed zones.
 
     Points on the boundaries of zones are treated like returns of the lidar: the swept footprint must not reach them.
-    A robot with zones stands while it does not know its pose; an operator moves it slowly with the second control.
+    With zones, a robot without a known pose does not move; an operator can move it slowly with the second control.
 
     Args:
         config: settings of the zones.
@@ -70,7 +70,7 @@ class ZoneCheck(Check):
         self._blocked = False
         """Whether a keepout zone ahead allows no motion."""
         self._unknown = ""
-        """Why zones cannot be kept."""
+        """Reason why the zones cannot be checked."""
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
         """Take poses, zones and the health of the localisation; at a tick, find the zones that the robot is in."""
@@ -112,12 +112,12 @@ class ZoneCheck(Check):
         return f"zones cannot be checked: {why}" if why else ""
 
     def reason(self, now: int) -> Iterator[Reason]:
-        """Stand inside a keepout zone."""
+        """Stop the robot inside a keepout zone."""
         if self._held:
             yield Reason.KEEPOUT
 
     def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
-        """Return the limits at the robot's place and ahead of it."""
+        """Return the limits at the robot's position and ahead of it."""
         self._ahead = None
         if not courses:
             self._blocked = False

@@ -1,4 +1,4 @@
-"""Long searches in pieces, with a budget per scan in units of work instead of time, so that runs repeat exactly.
+"""Long searches in pieces, with a budget per scan in units of work instead of time, so that runs are reproducible.
 
 A search is a generator that yields the cost of every piece before it executes it. The unit is one look-up in a
 likelihood grid, 2 to 3 ns; other work is converted to it.

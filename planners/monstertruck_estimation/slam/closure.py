@@ -3,12 +3,12 @@
 Candidates are keyframes that may be near within the bound of the drift: the likeliest by position, and the most similar
 by descriptor. The surroundings of the latest keyframe are matched to those of the candidate by branch and bound, then
 by ICP; a single scan would look the same all along a corridor. A match in a small window is accepted at once. A match
-in a wide window waits until others, from different places, agree with it (pairwise consistency: Mangelson et al. 2018).
-A closure that the optimised graph contradicts is removed.
+in a wide window is pending until others, from different places, agree with it (pairwise consistency: Mangelson et al.
+2018). A closure that the optimised graph contradicts is removed.
 
-A place seen again from the other side overlaps little. At the end of a run (``review``), where the drift is small, a
-match is also accepted if the part within view of the place fits and neither side looked through the other's walls. A
-single match of this kind proves nothing, so it needs supporting matches in every window.
+A place that is revisited from the other side overlaps little. At the end of a run (``review``), where the drift is
+small, a match is also accepted if the part within view of the place fits and no beams of either side pass through the
+other's walls. A single match of this kind is insufficient, so it needs supporting matches in every window.
 """
 
 import math
@@ -330,7 +330,9 @@ class LoopCloser:
 def _split_by_consistency(
     keyframes: KeyframeMap, hit: LoopMatch, others: list[LoopMatch]
 ) -> tuple[list[LoopMatch], list[LoopMatch]]:
-    """Tell which of ``others`` form a consistent loop with ``hit``, and which contradict it; others are undecided."""
+    """Return those of ``others`` consistent in a loop with ``hit``, and those contradicting it; the rest is
+    undecided.
+    """
     agreeing: list[LoopMatch] = []
     against: list[LoopMatch] = []
     others = [other for other in others if other.target != hit.target]

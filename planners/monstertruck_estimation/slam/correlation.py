@@ -72,9 +72,9 @@ class Peak:
     score: float
     """Mean likelihood of the points there, 0..1."""
     rival: float
-    """Best score of a clearly different pose in the window; 0 if none came near."""
+    """Best score of a clearly different pose in the window; 0 if none scores nearly as well."""
     unseen: float = 0.0
-    """Upper bound of a rival's score after a search that ended early; else 0."""
+    """Upper bound of a rival's score after a search that ended early; otherwise 0."""
 
 
 def look_ups(points: Array, window: tuple[float, float], levels: int) -> float:
@@ -88,11 +88,11 @@ class RivalSearch:
     """Required result about the best pose that is clearly different from the best of all."""
 
     apart: float
-    """Its distance is at least this, m; or that arc at the typical range."""
+    """Minimum distance from the best pose, m; also as an arc at the typical range."""
     least: float = 0.8
-    """Rivals scoring less than this share of the best score do not matter."""
+    """Minimum score of a rival, as a fraction of the best score."""
     enough: float = math.inf
-    """Nor does how much more than this share a rival scores."""
+    """Fraction of the best score above which a rival's exact score is irrelevant."""
 
 
 def correlate(
@@ -140,7 +140,7 @@ def correlation(
     turns = np.arange(-half, half + 1, dtype=np.float64) * step
     cells = math.ceil(window[0] / RESOLUTION)
     offsets = _rotated(points, guess, turns, grid.origin[0], grid.origin[1])
-    doubt = 0.002  # penalty of a squared standard deviation from the guess, as share of the score
+    doubt = 0.002  # penalty per squared standard deviation from the guess, as a fraction of the score
     penalty = (doubt * (RESOLUTION / deviation[0]) ** 2, doubt / deviation[1] ** 2)
     top = _top(len(grid.levels), cells)
     at_once = max(int(PIECE / (_per_axis(cells, top) ** 2 * len(points))), 1)
@@ -166,9 +166,11 @@ def correlation(
 
 
 _Place = tuple[Pyramid, Blocks, Array, int, float, float, Blocks, Array]
-"""Arguments of ``_search`` that say where to look."""
+"""Arguments of ``_search`` that define the searched window."""
 _Zone = tuple[int, float, float, float, float]
-"""Those that say where not to: turn, x and y of the middle, cells and turns round it."""
+"""Arguments of ``_search`` that define the excluded zone: turn, x and y of its centre, and its half sizes in cells and
+turns.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +185,7 @@ class _SearchEnd:
 
 
 def _searched(place: _Place, least: float, enough: float, zone: _Zone, work: float) -> Pieces[_SearchEnd]:
-    """Search best first, in pieces."""
+    """Search best-first, in pieces."""
     count = place[1].shape[1]
     state: _State = (least, -1, 0, 0, 0, 0, np.empty(1024), np.empty((1024, 4), np.int32))
     left = work
@@ -219,7 +221,7 @@ def _dot(grid: Pyramid, px: float, py: float) -> None:
     cx, cy = int(px), int(py)
     # The exponential of a sum is a product: one factor per column and one per row.
     along = np.empty(2 * half + 1)
-    # Standard deviation of the likelihood round a surface, m: cell size, noise and half a step of the search.
+    # Standard deviation of the likelihood around a surface, m: cell size, noise and half a step of the search.
     smear = 0.08
     for k in range(2 * half + 1):
         dx = (cx - half + k + 0.5 - px) * RESOLUTION
@@ -385,7 +387,7 @@ def _search(
 
 @njit(cache=True)
 def _float(keys: Array, heap: Blocks, at: int, bound: float, k: int, x: int, y: int, level: int) -> None:
-    """Add a block to the heap at its end, ``at``."""
+    """Add a block to the end of the heap, ``at``, and restore the heap."""
     while at:
         above = (at - 1) // 2
         if keys[above] >= bound:
@@ -444,7 +446,7 @@ def merged(scans: Sequence[Scan], poses: Array) -> Scan:
         variances.append(scan.variances)
         extents.append(scan.extents)
     every = np.concatenate(points), np.concatenate(normals), np.concatenate(variances), np.concatenate(extents)
-    merge_cell = 0.05  # elements within a square of this edge that face the same way become one, m
+    merge_cell = 0.05  # edge of the squares within which elements with the same orientation are merged, m
     # Cell and octant of the normal identify the piece of surface.
     cells = np.floor(every[0] / merge_cell).astype(np.int64)
     facing = np.floor(np.arctan2(every[1][:, 1], every[1][:, 0]) / (np.pi / 4) + 0.5).astype(np.int64) % 8

@@ -1,12 +1,12 @@
-"""Global localisation: find the robot's place on a saved map, or that it is not on the map.
+"""Global localisation: finds the robot's pose on a saved map, or detects that it is not on the map.
 
-A local map is built from the first scans, because a single scan of a 4 m lidar looks alike in many rooms. At every
+A local map is built from the first scans, because single scans of a 4 m lidar look alike in many rooms. At every
 keyframe, its surroundings are matched to the whole saved map by branch and bound (Hess et al. 2016, section V), in
 pieces over the following scans; the next search begins at the latest keyframe. The result of a search is a hypothesis,
-which is accepted under three conditions. It fits again some distance further on: in a second search or, if the search
-found no similar place, at the pose predicted from motion. Everything seen between both fits matches the map, too. The
-beams since the first search do not contradict the saved grid. Unmapped ground fits nowhere but contradicts nothing, so
-a robot that has crossed it is found once it is back.
+which is accepted under three conditions. It fits again after some distance: in a second search or, if the search found
+no similar place, at the pose predicted from motion. Everything seen between both fits also matches the map. The beams
+since the first search do not contradict the saved grid. Unmapped ground fits nowhere but contradicts nothing, so a
+robot that has crossed it is found after its return.
 """
 
 import math
@@ -70,7 +70,7 @@ class SearchResult:
 
 
 class GlobalLocaliser:
-    """Find the robot anywhere on a map.
+    """Finds the robot anywhere on a map.
 
     Args:
         submap: surfaces of the whole map.
@@ -128,7 +128,7 @@ class GlobalLocaliser:
     def _kept(self) -> Array | None:
         """Return the pose of the latest keyframe if a unique place still fits after the baseline.
 
-        A rival place would have to fit both there and here; the search that found this one has ruled that out.
+        A rival place would have to fit at both poses; the search that found this place has ruled that out.
         """
         newest = len(self._mapper.map) - 1
         for hypothesis in self._hypotheses:

@@ -1,8 +1,8 @@
 """kiss-icp (Vizzo et al. 2023) for planar scans: its map and registration as a scan matcher.
 
 All points are kept, because the package's own second downsampling leaves too few of a planar scan. The matcher returns
-neither a score nor a failure, so every result is measured like our own (overlap, residual, information) and passes the
-same gate.
+neither a score nor a failure, so every result is evaluated like those of the built-in matcher (overlap, residual,
+information) and passes the same gate.
 """
 
 import math
@@ -73,7 +73,7 @@ def _matrix(pose: Array) -> Array:
 
 
 class KissMatcher:
-    """``ScanMatcher`` that registers to the mapper's submap, so that loop closures move its map along."""
+    """``ScanMatcher`` that registers to the mapper's submap, so that its map moves with loop closures."""
 
     def __init__(self) -> None:
         self._map = KissMap()

@@ -21,7 +21,7 @@ class LinePeak(NamedTuple):
     pose: Array
     """Pose of base in map, shape (3,)."""
     apart: bool
-    """Whether it is not the match's place."""
+    """Whether it is at a different place than the match."""
     only: bool
     """Whether all other places fit clearly worse."""
 

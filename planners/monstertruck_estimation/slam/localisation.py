@@ -1,8 +1,8 @@
 """Localisation in a saved map: tracking by scan matching, and a search of the whole map for an unknown place.
 
-Over the metres after a search of the whole map, the estimator verifies its result. It also checks every match against
-the saved grid, and rejects a match that fits walls while its beams cross others. Beams that end in unknown cells are
-not matched: at the edge of the map they are no evidence for or against a pose.
+During the first metres after a search of the whole map, the estimator verifies its result. It also checks every match
+against the saved grid, and rejects a match whose beams cross walls of the map. Beams that end in unknown cells are not
+matched: at the edge of the map they carry no evidence for or against a pose.
 """
 
 import math
@@ -86,7 +86,7 @@ class LocalisationEstimator:
         self._evidence = EvidenceGrid(saved.grid)
         self._global = self._search_anew() if start is None else None
         self._tracking = start is not None
-        """Whether the place is known; a search that still runs verifies it."""
+        """Whether the pose is known; a search that still runs verifies it."""
         self._checked = 0.0
         """Distance travelled since the place was found (m)."""
         self._pose = np.array(start or (0.0, 0.0, 0.0))

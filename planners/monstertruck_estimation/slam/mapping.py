@@ -72,7 +72,7 @@ class MappingEvent(StrEnum):
     PARTED = "parted"
     """The join of two submaps was wrong and is undone."""
     CHANGED = "changed"
-    """The mapped surroundings of the robot are gone, as on another floor."""
+    """The mapped surroundings of the robot have disappeared, as on another floor."""
 
 
 @dataclass(frozen=True, slots=True)

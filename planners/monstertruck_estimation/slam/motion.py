@@ -40,13 +40,13 @@ One scan with a late stamp must not suffice.
 
 
 class OdometryCheck:
-    """Compare distances and turns by odometry with those by the scans, which are independent of the wheels.
+    """Compares distances and turns by odometry with those by the scans, which are independent of the wheels.
 
-    The differences of their motions are summed over some seconds: disagreeing clocks shift both a little but change no
-    sum. A slow robot is compared over as much motion as a fast one: within seconds alone, its error would stay below
-    the tolerance. A contradicted quantity, distances or turns, must agree step by step over 2 m or 2 rad before
-    odometry is used again: a turn of the wrong sign agrees as long as the robot drives straight. If distances are
-    contradicted, turns remain in use while they agree over the whole comparison, and the reverse.
+    The differences of their motions are summed over some seconds: a clock offset shifts both slightly but does not
+    change the sums. A slow robot is compared over as much motion as a fast one: within seconds alone, its error would
+    stay below the tolerance. A contradicted quantity, distances or turns, must agree step by step over 2 m or 2 rad
+    before odometry is used again: a turn of the wrong sign agrees as long as the robot drives straight. If distances
+    are contradicted, turns remain in use while they agree over the whole comparison, and vice versa.
     """
 
     def __init__(self) -> None:

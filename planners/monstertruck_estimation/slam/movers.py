@@ -1,8 +1,9 @@
 """Detection of moving people and robots by comparing a scan with one about a second older.
 
-A crowd that walks along fits best at its previous place, so it drags the match along, especially in a corridor, whose
-walls do not constrain the motion ahead. A point moves if an older scan looked through its place, or if the object that
-hid its place has left. Moving objects are narrow: a whole wall that seems to move contradicts odometry, and is kept.
+A crowd that walks along with the robot fits best at its previous position and biases the match, especially in a
+corridor, whose walls do not constrain the motion ahead. A point is moving if a beam of an older scan passed through its
+position, or if the object that hid its position has left. Moving objects are narrow: a whole wall that seems to move
+contradicts odometry, and is kept.
 """
 
 import math

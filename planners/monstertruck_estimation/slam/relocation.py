@@ -6,8 +6,8 @@ not join to the map. The surroundings of the latest keyframe are searched for in
 like every loop closure, and joins both submaps only with the support of matches from other places. A submap whose place
 was not found at first is found when the robot returns to it, from the map or from a later submap.
 
-A join may still be wrong: a similar-looking room fits just as well. A join therefore stays in doubt while the robot
-drives on, and is undone if later observations of both sides contradict it, or if the robot is lost again.
+A join may still be wrong, because a similar-looking room fits equally well. A join therefore stays unconfirmed while
+the robot continues, and is undone if later observations of both sides contradict it, or if the robot is lost again.
 """
 
 import math

@@ -33,7 +33,7 @@ class MatchStatus(StrEnum):
     CONTRADICTED = "contradicted"
     """Beams of the scan pass through walls of the map, or beams of the map through objects in the scan."""
     UNSURE = "unsure"
-    """After a gap in the scans the robot may be anywhere, so one fitting place is not a proof."""
+    """After a gap in the scans the robot may be anywhere, so a single fitting place is insufficient."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class ScanMatch:
     information: Array | None = None
     """Inverse covariance by the scan alone, without the guess, shape (3, 3); None if the match is rejected."""
     moving: float = 0.0
-    """Share of the scan's points left out as moving, 0..1."""
+    """Fraction of the scan's points removed as moving, 0..1."""
 
     @property
     def accepted(self) -> bool:

@@ -258,8 +258,8 @@ def _surface(points, origins, joined, reach, increment, near, i, normals, varian
     length = math.hypot(bx, by)
     if length < 1e-9:
         bx, by, length = 1.0, 0.0, 1.0
-    slanted = 3.0  # two lone neighbours this many beam spacings apart lie on a wall seen at a slant
-    # Two points far apart are the thin end of a wall along the beam; two close together may be a chair leg.
+    slanted = 3.0  # two lone neighbours this many beam spacings apart are on a wall seen at an oblique angle
+    # Two points far apart are the end of a wall along the beam; two close together may be a chair leg.
     if count >= 3 or (count == 2 and furthest > slanted * spacing):
         mx, my = sx / count, sy / count
         cxx, cxy, cyy = sxx / count - mx * mx, sxy / count - mx * my, syy / count - my * my

@@ -28,9 +28,9 @@ class LocalPlannerState:
     path: MotionPath | None = None
     """Result of the last cycle."""
     failed: int = 0
-    """Number of successive local searches without a result; after some, another heading is tried at the goal."""
+    """Number of successive local searches without a result; after several, another heading at the goal is tried."""
     turning: tuple[float, ...] = ()
-    """Emergency turn: initial x, y, yaw, and wanted yaw."""
+    """Emergency turn: initial x, y, yaw, and target yaw."""
 
     @property
     def final(self) -> bool:
@@ -43,7 +43,7 @@ class LocalPlan:
     """Drivable path around the obstacles, or the reason for its absence."""
 
     reason: Reason
-    """OK; PATH_PARTIAL: ``path`` is the free part; otherwise there is no path."""
+    """OK; PATH_PARTIAL if ``path`` is only the free part; with any other reason there is no path."""
     state: LocalPlannerState
     """State for the next cycle."""
     path: MotionPath | None = None
@@ -66,8 +66,8 @@ class LocalPlanner(Protocol):
         Args:
             route: poses of the reference point.
             obstacles: obstacles in a window around the truck.
-            pose: x, y, yaw of the reference point, in the frame of both.
-            state: state of the cycle before, ``LocalPlannerState()`` at first.
+            pose: x, y, yaw of the reference point, in the frame of route and obstacles.
+            state: state of the previous cycle; initially ``LocalPlannerState()``.
 
         Raises:
             InputError: the pose is not finite or has a wrong shape.

@@ -1,4 +1,4 @@
-"""Local planners, which deform a route, by ``kind``; they run in workers."""
+"""Local planners by ``kind``; they deform a route and run in workers."""
 
 from typing import TYPE_CHECKING, Annotated, Final, cast
 
@@ -34,16 +34,16 @@ LOCAL_PLANNERS: Final = Catalog(
     ),
     base=LocalPlannerConfig,
 )
-"""A local planner kind is built from the vehicle and its settings, and is a ``LocalPlanner``."""
+"""Local planner kinds; each is built from the vehicle and its settings, and is a ``LocalPlanner``."""
 
 AnyLocalPlanner = Annotated[LocalPlannerConfig, LOCAL_PLANNERS.section()]
-"""Section `planner.local_planner` of the configuration."""
+"""Type of the section `planner.local_planner` of the configuration."""
 
 
 def make_local_planner(vehicle: "Vehicle", config: LocalPlannerConfig) -> "LocalPlanner":
     """Build the local planner of a configuration.
 
     Raises:
-        InputError: the settings name no kind of local planner, or a required package is not installed.
+        InputError: the kind is unknown, or a required package is not installed.
     """
     return cast("LocalPlanner", LOCAL_PLANNERS.build(config, vehicle, config))

@@ -15,17 +15,17 @@ class BandConfig(Schema):
     """Elastic band."""
 
     overlap: Annotated[float, Field(gt=0, le=1)] = 0.7
-    """Maximum distance of touching bubbles, as a share of the sum of their radii."""
+    """Maximum distance of touching bubbles, as a fraction of the sum of their radii."""
     internal_gain: NotNegative = 1.0
     """Gain of the attraction by both neighbours."""
     external_gain: NotNegative = 2.0
     """Gain of the repulsion by obstacles."""
     iterations: Count = 5
-    """Number of sweeps over the band and back."""
+    """Number of forward and backward sweeps over the band."""
     depth: Count = 5
     """Number of times that an overshooting step, or a gap, is halved."""
     overshoot: Positive = 0.75
-    """Minimum share of the previous force above which a reversed force is an overshoot."""
+    """Minimum fraction of the previous force above which a reversed force is an overshoot."""
     significant: Positive = 0.1
     """Minimum force of an overshoot."""
     tiny: Positive = 0.01
@@ -38,11 +38,11 @@ class PeopleConfig(Schema):
     """Walking people near the robot."""
 
     speed: Positive = 0.25
-    """Minimum speed of a walking person (m/s); slower objects are obstacles at their current places."""
+    """Minimum speed of a walking person (m/s); slower objects are obstacles at their current positions."""
     horizon: Annotated[float, Field(gt=0, le=5)] = 2.0
     """Time over which people are predicted along their motion (s)"""
     distance: NotNegative = 0.2
-    """Distance from their predicted places (m)."""
+    """Minimum distance from predicted positions of people (m)."""
     spread: NotNegative = 0.1
     """Growth of that distance with the prediction time (m/s)."""
     patience: Positive = 8.0
@@ -54,59 +54,59 @@ class LocalPlannerConfig(Schema):
 
     band: BandConfig = BandConfig()
     margin: NotNegative = 0.02
-    """Kept between footprint and obstacles (m)."""
+    """Minimum distance between footprint and obstacles (m)."""
     reach: Positive = 3.0
-    """Length of the route regarded (m)."""
+    """Length of the route that is considered (m)."""
     inset: NotNegative = 0.1
-    """Distance between the window's border and the circle around the footprint where the route is cut (m)."""
+    """Distance of the footprint's circle from the window's border at which the route is cut (m)."""
     effort: Count = 1100
-    """Number of expanded nodes and smoothing trials of a local search, which bounds the time of a cycle."""
+    """Number of expanded nodes and smoothing trials of a local search, which limits the time of a cycle."""
     reverse_cost: Annotated[float, Field(ge=1)] = 3.0
-    """Cost of a metre backward, where the lidar does not look (m)."""
+    """Cost of a metre in reverse, where the lidar has no view (m)."""
     cusp_cost: NotNegative = 0.3
     """Cost of a change of direction (m)."""
     crab_cost: Annotated[float, Field(ge=1)] = 1.05
     """Cost of a metre of translation (m)."""
     clearance_cost: NotNegative = 0.5
-    """Extra cost of a metre in contact, falling to 0 where obstacles are 0.1 m away (m)."""
+    """Extra cost of a metre in contact (m); it decreases to 0 at a clearance of 0.1 m."""
     shortest: Positive = 0.15
-    """Minimum length of the free beginning of a blocked path for driving it (m)."""
+    """Minimum length of the free part of a blocked path for driving it (m)."""
 
 
 class RsbandConfig(LocalPlannerConfig):
-    """Elastic band, then Reeds-Shepp motions that join its poses, with the truck's own turning radius."""
+    """Elastic band whose poses are joined by Reeds-Shepp motions with the truck's own turning radius."""
 
     kind: Literal["rsband"] = "rsband"
     strategy: Strategy = "start_to_next"
     """Method that joins the poses of the band to a path."""
     sub_goal: Positive = 0.6
-    """Length of band to the goal of ``start_to_next`` (m)."""
+    """Length of the band up to the goal of ``start_to_next`` (m)."""
     spacing: Positive = 0.4
     """Distance between the band poses that are joined one by one (m)."""
     renew: Positive = 0.5
-    """Share of a path's length below which the remaining path is replaced."""
+    """Fraction of a path's length below which the remaining path is replaced."""
     off_path: Positive = 0.1
-    """A path is replaced when the truck is further away from it (m)."""
+    """Distance of the truck from a path above which the path is replaced (m)."""
 
 
 class PublishedConfig(LocalPlannerConfig):
-    """The published planner: turning radius 1.0 m whatever the truck, states 0.3 m from obstacles, its known faults."""
+    """The published planner: turning radius 1.0 m for any truck, states 0.3 m from obstacles, and its known faults."""
 
     kind: Literal["rsband-as-published"] = "rsband-as-published"
     strategy: Strategy = "start_to_next"
     """Method that joins the poses of the band to a path."""
     sub_goal: Positive = 0.6
-    """Length of band to the goal of ``start_to_next`` (m)."""
+    """Length of the band up to the goal of ``start_to_next`` (m)."""
     radius: Positive = 1.0
     """Turning radius (m)."""
     inflation: Positive = 0.3
-    """Radius of the inflation; states must lie outside of it (m)."""
+    """Inflation radius (m); states must be outside of it."""
     emergency: bool = True
-    """Turn by 45 degrees and more if no path is found."""
+    """Whether to turn by 45 degrees or more if no path is found."""
 
 
 class TebConfig(LocalPlannerConfig):
-    """Timed elastic band: poses and time steps, by sparse least squares."""
+    """Timed elastic band: poses and time steps, optimised by sparse least squares."""
 
     kind: Literal["teb"] = "teb"
     spacing: Positive = 0.1
@@ -114,7 +114,7 @@ class TebConfig(LocalPlannerConfig):
     iterations: Count = 8
     """Number of Gauss-Newton steps per cycle."""
     clearance: Positive = 0.1
-    """Preferred between footprint and obstacles (m)."""
+    """Preferred distance between footprint and obstacles (m)."""
     obstacle_weight: Positive = 30.0
     """Weight of clearances below ``clearance``."""
     steering_weight: Positive = 200.0
@@ -128,10 +128,10 @@ class TebConfig(LocalPlannerConfig):
     time_weight: Positive = 0.3
     """Weight of the time."""
     speed: Positive = 0.2
-    """Forward (m/s)."""
+    """Maximum speed forward (m/s)."""
     reverse_speed: Positive = 0.15
-    """Backward (m/s)."""
+    """Maximum speed in reverse (m/s)."""
     acceleration: Positive = 0.5
-    """m/s^2."""
+    """Maximum acceleration (m/s^2)."""
     steering_rate: Positive = 1.0
     """Maximum steering rate of an axle (rad/s)."""

@@ -27,7 +27,7 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason
 
 PATH_CUSP_REACHED = 0.02
-"""The same for a cusp of its path (m)."""
+"""Distance to a cusp of its path within which the truck continues with the part after the cusp (m)."""
 
 
 @njit(cache=True)
@@ -50,15 +50,15 @@ def escape_motion(
     """
     least = clearance(field, cover, pose[0], pose[1], pose[2])
     escape_step = 0.01  # distance between two checks of an escape motion, m
-    best, shortest = -1, 0.3 + escape_step  # longest escape motion, m
-    if least >= -0.05:  # a truck that overlaps an obstacle by more has no escape motion, m
+    best, shortest = -1, 0.3 + escape_step  # maximum length of an escape motion, m
+    if least >= -0.05:  # a truck with a larger overlap has no escape motion, m
         for i in range(len(primitives)):
             sign = 1.0 if primitives[i, 0] > 0.0 else -1.0
             known, travelled = least, escape_step
             while travelled < shortest - 0.5 * escape_step:
                 x, y, yaw = advance(pose[0], pose[1], pose[2], sign * travelled, primitives[i, 1], primitives[i, 2])
                 present = clearance(field, cover, x, y, yaw)
-                if present < known - 2e-3:  # clearances that differ by less are equal, m
+                if present < known - 2e-3:  # clearances that differ by less count as equal, m
                     break
                 known = max(known, present)
                 if safe_distance(field, footprint, margin, x, y, yaw) >= 0.0:
@@ -74,14 +74,14 @@ def escape_motion(
 
 @dataclass(frozen=True)
 class CycleStart:
-    """Start of a cycle."""
+    """State at the start of a cycle."""
 
     robot_pose: Array
-    """Shape (3,): the truck's pose."""
+    """Pose of the truck, shape (3,)."""
     band: PosePath
-    """Route in the window, from near the truck to the last free pose."""
+    """Route in the window, from the truck to the last free pose."""
     state: LocalPlannerState
-    """Return the state with the new band."""
+    """State with the new band."""
 
 
 class LocalPlannerCore:
@@ -255,12 +255,12 @@ class LocalPlannerCore:
         return LocalPlan(reason, after, text=text)
 
     def _approach(self, band: PosePath, obstacles: DistanceField, robot_pose: Array) -> MotionPath | None:
-        """Return the motion along the band to 0.5 m before the obstacle; None if the truck is there."""
+        """Return the motion along the band to 0.5 m before the obstacle; None if the truck is already there."""
         free = obstacles.free(self.vehicle.footprint, band.poses, self.config.margin)
         broken = len(free) if free.all() else int(np.argmin(free))
         travelled = band.travelled
         first_run = next(end for _, end in direction_runs(band.directions))
-        # 0.5: a truck that finds no way around an obstacle approaches it along the route up to this distance, m
+        # 0.5: distance at which a truck without a way around an obstacle stops its approach along the route, m
         near = np.flatnonzero(travelled[:first_run] <= travelled[max(broken - 1, 0)] - 0.5)
         if not len(near) or travelled[near[-1]] < self.config.shortest:
             return None

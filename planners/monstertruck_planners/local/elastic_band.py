@@ -33,7 +33,7 @@ class CoveringDiscs(NamedTuple):
     y: Array
     """Centres relative to the pose (m)."""
     radius: Array
-    """m."""
+    """Radii (m)."""
     reach: float
     """Maximum distance of a centre from the pose (m)."""
 
@@ -54,11 +54,11 @@ class BandParameters(NamedTuple):
     scale: float
     """Ratio of a bubble's radius to its clearance: 1; 0.5 in the published planner."""
     reach: float
-    """Metres per radian between two headings; 0 in the published planner."""
+    """Distance equivalent to a heading difference (m/rad); 0 in the published planner."""
     spacing: float
-    """Maximum distance of neighbours (m)."""
+    """Maximum distance between neighbours (m)."""
     published: bool
-    """Steps of a whole radius, and a previous force that counts its x twice and its y never."""
+    """Whether to move by a whole radius, with a previous force that uses x twice and y never."""
 
 
 @njit(cache=True)
@@ -204,12 +204,12 @@ def _force(
 
 @njit(cache=True)
 def _move(field: FieldData, cover: CoveringDiscs, parameters: BandParameters, band: Array, i: int) -> None:
-    """Move one bubble along its force, as long as it stays free and near its neighbours."""
+    """Move one bubble along its force while it stays free and close to its neighbours."""
     before, here, after = band[i - 1], band[i], band[i + 1]
     fx, fy = _force(field, cover, parameters, before, here, after)
     gain = max(here[3], parameters.tiny)
     if not parameters.published:
-        # A whole radius overshoots where neighbours are nearer than that.
+        # A step of a whole radius overshoots if the neighbours are closer than that.
         near = min(hypot(here[0] - before[0], here[1] - before[1]), hypot(here[0] - after[0], here[1] - after[1]))
         gain = min(gain, 0.5 * near)
     trial = here.copy()
@@ -275,7 +275,7 @@ def update_radii(field: FieldData, cover: CoveringDiscs, parameters: BandParamet
 def _relax(
     field: FieldData, cover: CoveringDiscs, parameters: BandParameters, band: Array, fixed: BoolArray, count: int
 ) -> tuple[int, bool]:
-    """Move a connected band to its equilibrium; ends and cusps stay.
+    """Move a connected band to its equilibrium; ends and cusps stay in place.
 
     Returns:
         Number of bubbles, and whether the band is still connected; if not, its state is undefined.
@@ -297,14 +297,14 @@ def _relax(
 
 @dataclass(frozen=True)
 class BandResult:
-    """A band after relaxation."""
+    """Result of a relaxation."""
 
     path: PosePath | None
-    """None: it is broken."""
+    """Path of the band; None if it is broken."""
     broken: int
-    """Number of bubbles before the first one in contact; their total number without contact."""
+    """Number of bubbles before the first one in contact; the total number if none is."""
     radii: Array
-    """Shape (n,) (m); of the path's poses."""
+    """Radii at the path's poses, shape (n,) (m)."""
 
 
 def cover_footprint(footprint: Footprint | DiscFootprint) -> CoveringDiscs:
@@ -334,7 +334,7 @@ def band_parameters(config: BandConfig, cover: CoveringDiscs) -> BandParameters:
     return BandParameters(
         config.overlap, config.internal_gain, config.external_gain, config.iterations, config.depth,
         config.overshoot, config.significant, config.tiny, config.largest,
-        1.0, 0.5 * cover.reach, 0.2, False,  # largest distance of bubbles, m
+        1.0, 0.5 * cover.reach, 0.2, False,  # maximum distance of bubbles, m
     )  # fmt: skip
 
 
@@ -384,7 +384,7 @@ def _cusps(path: PosePath) -> NDArray[np.int64]:
 
 
 def _sideslips(path: PosePath) -> Array:
-    """Return the angle from heading to course of every pose (rad); small angles are corners of the path, not crab."""
+    """Return the angle from heading to course of every pose (rad); small angles are corners, not crabbing."""
     steps = np.diff(path.poses[:, :2], axis=0)
     if not len(steps):
         return np.zeros(len(path.poses))

@@ -20,7 +20,7 @@ from monstertruck_planners.local.config import PeopleConfig
 from monstertruck_runtime.clock import SECOND
 
 LEGS_APART: Final = 0.3
-"""Maximum distance of neighbouring returns of one person (m): two legs."""
+"""Maximum distance between neighbouring returns of one person (m), as of two legs."""
 MEMORY: Final = 0.8
 """Time over which a velocity is measured (s)."""
 
@@ -30,18 +30,18 @@ class Walker:
     """A walking person, as a disc."""
 
     place: tuple[float, float]
-    """Centre (m)."""
+    """Position of the centre (m)."""
     velocity: tuple[float, float]
-    """In m/s."""
+    """Velocity (m/s)."""
     radius: float
-    """In m."""
+    """Radius (m)."""
 
     def at(self, times: Array) -> Array:
         """Return the predicted centres at times from now (s), shape (n, 2) (m)."""
         return np.asarray(np.array(self.place) + times[:, None] * self.velocity)
 
     def carried(self, base: Pose2, other: Pose2) -> "Walker":
-        """Return the person in another frame, from the poses of the base in this frame and in the other one."""
+        """Return the person in another frame, given the pose of the base in this frame and in the other one."""
         (place,) = points_placed(points_relative(np.array([self.place]), base), other).tolist()
         turn = other[2] - base[2]
         return replace(self, place=(place[0], place[1]), velocity=to_world(turn, *self.velocity))
@@ -49,21 +49,21 @@ class Walker:
 
 @dataclass(eq=False)
 class _PersonTrack:
-    """Places of one group of returns."""
+    """Positions of one group of returns over time."""
 
     rows: deque[tuple[int, float, float]] = field(default_factory=deque)
     """Stamp (ns) and centre (m)."""
     radius: float = 0.0
 
     def place(self, stamp: int) -> tuple[float, float]:
-        """Return the place at a stamp, predicted by the measured velocity."""
+        """Return the position at a stamp, predicted with the measured velocity."""
         at, x, y = self.rows[-1]
         vx, vy = self.velocity()
         passed = (stamp - at) / SECOND
         return x + vx * passed, y + vy * passed
 
     def velocity(self) -> tuple[float, float]:
-        """Return the velocity (m/s); 0 for a track shorter than half the memory."""
+        """Return the velocity (m/s); 0 for a track shorter than half of ``MEMORY``."""
         t, x, y = np.array(self.rows, dtype=float).T
         t = (t - t[-1]) / SECOND
         if t[0] > -MEMORY / 2:
@@ -73,7 +73,7 @@ class _PersonTrack:
 
 
 class PeopleTracker:
-    """Track the people around the robot.
+    """Tracks the people around the robot.
 
     Args:
         config: criteria for a walker.
@@ -91,9 +91,9 @@ class PeopleTracker:
         Args:
             stamp: stamp of the scan (ns).
             points: returns in the odometry frame, in the order of the beams, shape (n, 2) (m). In the map frame a
-                correction of the robot's pose would look like people who walk.
+                correction of the robot's pose would look like walking people.
             mapped: whether the map explains each point, shape (n,).
-            sensor: place of the lidar, shape (2,) (m).
+            sensor: position of the lidar, shape (2,) (m).
 
         Returns:
             The walkers, and whether each point belongs to one, shape (n,).
@@ -117,7 +117,7 @@ class PeopleTracker:
             if math.hypot(*velocity) >= self._config.speed:
                 walkers.append(Walker((x, y), velocity, track.radius))
                 walking[group] = True
-        # A person hidden for a moment keeps the track.
+        # A briefly hidden person keeps the track.
         self._tracks += [track for track in known if stamp - track.rows[-1][0] < MEMORY / 2 * SECOND]
         return tuple(walkers), walking
 
@@ -139,7 +139,7 @@ def _groups(points: Array, mapped: NDArray[np.bool_], sensor: Array) -> Iterator
 
 
 def _nearest(places: Mapping[_PersonTrack, tuple[float, float]], place: tuple[float, float]) -> _PersonTrack | None:
-    """Return the track whose predicted place is nearest, within the gap of a person's returns."""
+    """Return the track with the nearest predicted position, within the gap between a person's returns."""
     track = min(places, key=lambda one: math.dist(places[one], place), default=None)
     return track if track is not None and math.dist(places[track], place) < LEGS_APART else None
 

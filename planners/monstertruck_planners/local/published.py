@@ -31,7 +31,7 @@ AUTHORS = BandConfig(overlap=0.3, significant=0.1, largest=0.276)
 """Parameters of the author's robot."""
 
 TURN_STEP, TURN_MORE = math.radians(45.0), 0.5
-"""Of an emergency turn (rad)."""
+"""Angles of an emergency turn (rad)."""
 
 
 class PublishedPlanner:

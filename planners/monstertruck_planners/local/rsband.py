@@ -71,7 +71,7 @@ class RsbandPlanner:
         if far > self.config.off_path or not len(rest.segments):
             return False
         if to_end or to_cusp:
-            # 0.05: a path to a cusp is replaced when no more than this is left of it, m
+            # 0.05: remaining length at which a path to a cusp is replaced, m
             return rest.length > (PATH_CUSP_REACHED if to_end else 0.05)
         return rest.length > self.config.renew * self.config.sub_goal
 
@@ -168,7 +168,7 @@ class RsbandPlanner:
 
     @staticmethod
     def _is_detour(path: MotionPath, at: Array) -> bool:
-        # 1.6: a motion between two band poses is a detour if it is longer than this factor on their distance
+        # 1.6: ratio of motion length to distance above which a motion between two band poses is a detour
         return path.length > 1.6 * float(pose_distance(path.end, at))
 
     def _via_indices(self, band: PosePath) -> Iterator[int]:
@@ -189,7 +189,7 @@ class RsbandPlanner:
 
 
 def ends_at_cusp(path: MotionPath, band: PosePath) -> bool:
-    """Whether a path ends at a cusp of its band, or the band has passed that cusp already."""
+    """Whether a path ends at a cusp of its band, or the band has already passed that cusp."""
     if not len(path.segments):
         return False
     if path.segments[-1, 0] * band.directions[0] < 0:

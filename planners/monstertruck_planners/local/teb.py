@@ -64,7 +64,7 @@ class TebParameters(NamedTuple):
     reverse: float
     acceleration: float
     clearance: float
-    """Preferred (m)."""
+    """Preferred clearance (m)."""
     w_obstacle: float
     w_steering: float
     w_rate: float
@@ -80,7 +80,7 @@ class NormalEquations(NamedTuple):
     """Shape (4 n, WIDTH): lower diagonals; [i, k] couples the unknowns i and i - k."""
     gradient: Array
     jacobian: Array
-    """Shape (WIDTH,): derivatives of the residual at hand."""
+    """Derivatives of the current residual, shape (WIDTH,)."""
 
 
 @njit(cache=True)
@@ -303,7 +303,7 @@ def optimise(
             matrix[i, 0] += damping * (matrix[i, 0] + 1.0)
         for i in range(size):
             if i < 4 or size - 4 <= i < size - 1:
-                matrix[i, 0] += 1.0e9  # added to the diagonal for fixed unknowns
+                matrix[i, 0] += 1.0e9  # added to the diagonal of fixed unknowns
                 step[i] = 0.0
         if not _solve(matrix, step):
             damping *= 10.0
@@ -327,7 +327,7 @@ def optimise(
 
 
 STEERING_SHARE = 0.9
-"""Share of the steering that the least squares may use, as a reserve for their remaining violations."""
+"""Fraction of the steering range for the least squares; the rest is a reserve for their remaining violations."""
 
 
 class TebPlanner:
@@ -369,14 +369,14 @@ class TebPlanner:
             ahead = way or ahead
         done = state.final and ends_at(path, route.poses[-1])
         end = ahead.poses[-1]
-        # 0.05: a path that ends further from its band's end is only a part of it, m
+        # 0.05: distance between the ends of path and band above which the path is only a part, m
         whole = math.hypot(*(path.end - end)[:2]) < 0.05
         band = path.along(self.config.spacing) if whole else ahead
         after = replace(state, band=band, path=path, failed=0)
         return LocalPlan(Reason.OK, after, path, done, statistics=statistics)
 
     def _usable(self, rest: MotionPath, ahead: PosePath, obstacles: DistanceField) -> bool:
-        """Whether the last path may be kept: it is long enough, free, and does not end before the band."""
+        """Whether the last path can be kept: it is long enough, free, and does not end before the band."""
         long = rest.length > self.config.shortest
         near = long and math.hypot(*(rest.end - ahead.poses[-1])[:2]) < self.config.reach / 3
         return near and self._core.free(obstacles, rest)
@@ -429,7 +429,7 @@ def teb_parameters(vehicle: Vehicle, config: TebConfig) -> TebParameters:
         rate = config.steering_rate
     else:
         l_f, l_r, front, rear = vehicle.radius, 0.0, 1.0, 0.0
-        # 0.4: axle angle at the least turning radius, for the steering rate of trucks that cannot crab, rad
+        # 0.4: axle angle at the minimum turning radius, for the steering rate of trucks that cannot crab, rad
         rate = config.steering_rate / math.tan(0.4)
     return TebParameters(
         l_f, l_r, STEERING_SHARE * front, STEERING_SHARE * rear, rate,
@@ -473,7 +473,7 @@ def turns_soon(path: MotionPath) -> bool:
     """Whether the path changes direction soon."""
     signs = np.sign(path.segments[:, 0])
     change = np.flatnonzero(np.diff(signs))
-    # 0.25: nearer than this to a cusp the path stays as it is, m: a band could move its cusp away forever
+    # 0.25: distance to a cusp within which the path is kept, m: otherwise a band could move its cusp away forever
     return bool(len(change)) and float(np.abs(path.segments[: change[0] + 1, 0]).sum()) < 0.25
 
 
