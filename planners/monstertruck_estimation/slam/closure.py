@@ -330,8 +330,9 @@ class LoopCloser:
 def _split_by_consistency(
     keyframes: KeyframeMap, hit: LoopMatch, others: list[LoopMatch]
 ) -> tuple[list[LoopMatch], list[LoopMatch]]:
-    """Return those of ``others`` consistent in a loop with ``hit``, and those contradicting it; the rest is
-    undecided.
+    """Return those of ``others`` that form a consistent loop with ``hit``, and those that contradict it.
+
+    The rest is undecided.
     """
     agreeing: list[LoopMatch] = []
     against: list[LoopMatch] = []
