@@ -67,6 +67,7 @@ def run_with(target: Path, *arguments: str, cwd: Path = ROOT) -> str:
 def install(tmp_path, monkeypatch):
     """Installs a distribution with one module and entry points (``group:name``) for this process, in addition."""
     monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(entry_points, "_LEFT_OUT", {})
 
     def put(distribution, module, text, places):
         (tmp_path / f"{module}.py").write_text(text)
