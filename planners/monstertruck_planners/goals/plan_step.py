@@ -14,14 +14,14 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter
+from scipy.ndimage import distance_transform_edt, maximum_filter
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Pose2, placed, points_placed, points_relative
 from monstertruck_planners.collision import OCCUPIED, DistanceField, Footprint, rectangle_distance
 from monstertruck_planners.goals.escape import escape
 from monstertruck_planners.goals.exchange import PlanTask, RouteAnswer, Setup, explained_within
-from monstertruck_planners.goals.unseen import Unseen, unseen_around
+from monstertruck_planners.goals.unseen import BESIDE, Unseen, unseen_around
 from monstertruck_planners.pose_path import PosePath
 from monstertruck_planners.route.api import Clock, RouteMap, RoutePlanner, RouteResult, Vehicle, make_planner, warm_up
 from monstertruck_planners.route.config import GoalConfig, GridAstarConfig, HybridConfig, LatticeConfig
@@ -536,10 +536,9 @@ class PlanningStep:
         )
 
     def _closed_cells(self, shape: tuple[int, ...], resolution: float, origin: Pose2) -> NDArray[np.bool_] | None:
-        """Return the grid cells of the closed unseen places; None without any."""
-        if not len(self._closed):
-            return None
-        return marked(np.zeros(shape, np.bool_), self._closed, resolution, origin)
+        """Return the grid cells closed to reversing, within ``BESIDE`` of closed places; None without any."""
+        closed = marked(np.zeros(shape, np.bool_), self._closed, resolution, origin)
+        return np.asarray(distance_transform_edt(~closed) * resolution < BESIDE) if closed.any() else None
 
     def _standing(self, static_map: StaticMap, cells: Cells, pose: Pose2) -> RouteMap:
         """Return the map with free ground under the truck, padded in case the truck is at its edge."""

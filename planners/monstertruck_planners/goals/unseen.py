@@ -21,7 +21,8 @@ from monstertruck_planners.pose_path import PosePath
 SOON: Final = 5.0
 """Assumed time until a route begins (s)."""
 BESIDE: Final = 0.03
-"""Ground within this distance of the body is treated as under it (m), as in the gate."""
+"""Ground within this distance of the body is treated as under it, and a reverse motion ends this far before unseen
+ground (m), as in the gate."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class Unseen:
             gaps = rectangle_distance(self.footprint, pose[None], places)[0]
             # Mean speed along a route (m/s), used to estimate its time of arrival at a place.
             unseen = left < SOON + along / 0.1
-            if direction < 0 and (unseen & (gaps < -self.footprint.padding)).any():
+            if direction < 0 and (unseen & (gaps < BESIDE)).any():
                 # 0.6: unseen ground within this distance (m) of the reverse motion is closed to the next route: one
                 # truck length, since a route next to it would not be better
                 return np.asarray(places[unseen & (gaps < 0.6)])

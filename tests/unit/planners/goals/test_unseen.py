@@ -22,6 +22,7 @@ from monstertruck_planners.route.motion import MotionPath
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import Grid
+from monstertruckd.gate.scan_memory import DRIFT
 
 PACE = 0.1
 
@@ -134,6 +135,15 @@ def path(*legs: tuple[float, float]) -> PosePath:
 )
 def test_a_path_backs_onto_unseen_ground_beyond_where_it_began(legs, met):
     assert bool(len(backed_onto(path(*legs), survey()))) is met
+
+
+@pytest.mark.parametrize(("beyond", "met"), [(0.8, True), (1.2, False)])
+def test_a_reverse_motion_ends_where_the_gate_would_stop_before_unseen_ground(beyond, met):
+    assert BESIDE == DRIFT
+    places = np.array([(HERE[0] - 0.2 - BACK - beyond * DRIFT, HERE[1])])
+    unseen = Unseen(places, np.zeros(1), LIDAR, FIELD, 4.0, FOOTPRINT)
+    free = DistanceField(np.zeros((60, 100), np.bool_), 0.05)
+    assert bool(len(unseen.met(path((0.2, -1.0)), free))) is met
 
 
 def test_ground_ceases_to_be_seen_before_a_path_comes_to_it():
