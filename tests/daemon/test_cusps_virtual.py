@@ -19,6 +19,8 @@ CELL = 0.025
 X = 2.5
 NARROW = {"obstacle": {"ahead": 0.01, "side_clearance": 0.01}}
 """Let the truck near to walls."""
+SLOW = {"obstacle": NARROW["obstacle"] | {"memory_time": 60.0}}
+"""Under MPC the truck turns so slowly that the gate would by default (30 s) forget the ground behind it meanwhile."""
 
 
 def corridor(width: float, folder: Path) -> Path:
@@ -34,7 +36,7 @@ def corridor(width: float, folder: Path) -> Path:
     ("width", "kind", "seed", "gate"),
     [
         pytest.param(0.8, "lqr", 1, NARROW, marks=pytest.mark.long),
-        pytest.param(0.8, "mpc", 2, NARROW, marks=pytest.mark.long),
+        pytest.param(0.8, "mpc", 2, SLOW, marks=pytest.mark.long),
         pytest.param(0.9, "lqr", 3, {}, marks=pytest.mark.long),
     ],
 )
