@@ -236,7 +236,11 @@ class Mapper:
             return rejected(guess, covariance, MatchStatus.EMPTY)
         match = self._front.match(scan, delta, guess, covariance, self._submap)
         if self._motion.by_wheels(delta):
-            match = without_weak_direction(replace(match, moving=moving), guess, covariance)
+            match = replace(match, moving=moving)
+            bounded = without_weak_direction(match, guess, covariance)
+            # A weak constraint measures better than wheels, but less well than it claims: the walls' ends move along.
+            # People measure nothing.
+            match = replace(match, covariance=bounded.covariance) if match.degeneracy >= moving else bounded
         suspect, after_gap = self._loss.suspects(match, guess, covariance), self._loss.after_gap and match.accepted
         if self._loss.after_gap and self._led(match, delta, guess, covariance):
             return match
