@@ -19,12 +19,20 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode
 from monstertruck_sim.families import families
-from monstertruck_sim.faults import apply, place_obstacle
+from monstertruck_sim.faults import Fault, apply, command, place_obstacle
 from monstertruck_sim.world.obstacles import Disc
 from monstertruck_sim.world.world import World
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.drill.campaign import LEG, Campaign, TrialOutcome, drives_again, recovers, run_trials
+from monstertruckd.tools.drill.campaign import (
+    LEG,
+    Campaign,
+    Trial,
+    TrialOutcome,
+    drives_again,
+    recovers,
+    run_trials,
+)
 from monstertruckd.tools.drill.judge import WorldJudge
 from monstertruckd.tools.drill.observer import Observer
 from monstertruckd.tools.drill.random_drill import wired
@@ -451,6 +459,14 @@ def test_trials_have_pairs_both_directions_and_families_of_every_device() -> Non
     assert not any(outcome.stuck for outcome in outcomes), outcomes
     again = run_trials(Campaign(3, 6, demo()).legs()[0])
     assert again == outcomes
+
+
+def test_reasons_of_the_start_and_of_earlier_faults_still_explain_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    fault = Fault("stall", command("lidar", "line stalled on"), command("lidar", "line stalled off"), 1.0)
+    trial = Trial((fault,), ("stall",), backwards=False, between=0.0)
+    monkeypatch.setattr("monstertruckd.tools.drill.campaign._Draw.__call__", lambda _: trial)
+    outcomes = run_trials(campaign(2).legs()[0])
+    assert [outcome.reason for outcome in outcomes] == [Reason.SCAN_STALE] * 2
 
 
 @pytest.mark.long

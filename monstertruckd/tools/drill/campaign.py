@@ -9,7 +9,7 @@ As in ``random_drill``, a drill consists of legs, each with its own truck, clock
 
 import asyncio
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -45,6 +45,9 @@ LEG: Final = 20
 """Trials per truck."""
 MOVES: Final = 0.03
 """Minimum true speed of a driving robot (m/s); below its reverse speed into scarcely known ground."""
+UNSEEN: Final = frozenset({Reason.UNSEEN_STOP, Reason.UNSEEN_DRIVE, Reason.UNSEEN_SLOW})
+USUAL: Final = QUIET | OBSTACLE | UNSEEN | {Reason.ESTOP_REQUESTED, Reason.ESTOPPED, Reason.LEASE_EXPIRED}
+"""Reasons reported without a fault."""
 BY_HAND: Final[dict[str, Any]] = {
     "explorer": None,
     "planner": None,
@@ -235,14 +238,12 @@ class _Leg:
         """Run the trials of one truck."""
         if not await truck.until(lambda: not truck.blockers(), RECOVERY_LIMIT) or not await _arm(truck):
             return
-        usual = set(
-            QUIET | OBSTACLE | {Reason.ESTOP_REQUESTED, Reason.ESTOPPED, Reason.LEASE_EXPIRED}
-        )  # reasons reported without a fault
+        usual = set(USUAL)
         draw = _Draw(truck, self._rng, self._workers)
         while len(self._outcomes) < self._leg.count:
             if truck.by_hand is self._follows or not await _arm(truck):
                 return
-            usual |= {reason for report in truck.reports() for reason in reasons_of(report)}
+            truck.reports()  # of the start, or of the latest fault
             outcome = await _try(truck, draw(), self._rng, usual, self._number)
             self._outcomes.append(outcome)
             if outcome.stuck or outcome.violations:
@@ -331,15 +332,18 @@ def _blocked(truck: DrillTruck) -> bool:
 
 
 async def _try(
-    truck: DrillTruck, trial: Trial, rng: np.random.Generator, usual: Iterable[Reason], number: int
+    truck: DrillTruck, trial: Trial, rng: np.random.Generator, usual: set[Reason], number: int
 ) -> TrialOutcome:
-    """Drive, inject the faults, give a stop order during the last one, end it, recover, drive again."""
+    """Drive, inject the faults, give a stop order during the last one, end it, recover, drive again.
+
+    Reasons reported while the truck drives without a fault are added to ``usual``.
+    """
     clock, judge = truck.clock, truck.judge
     assert judge is not None
     await _turn(truck, trial)
     followed = not truck.by_hand
     await clock.sleep(float(rng.uniform(0.1, 0.7)))  # driving time before the first fault (s)
-    truck.reports()
+    usual |= {reason for report in truck.reports() for reason in reasons_of(report)}
     judge.begin()
     began, reverse = clock.now(), judge.speed < 0
     # 5: every fifth trial ends with an emergency stop, the others with a disarm order
@@ -362,7 +366,7 @@ async def _try(
             await clock.sleep(trial.between)
     ended = clock.now()
     await stopping
-    reason, reason_s = _first_reason(truck, set(usual), began)
+    reason, reason_s = _first_reason(truck, usual, began)
     recovered = await recovers(truck)
     seconds = (clock.now() - ended) / SECOND
     judge.look()
