@@ -68,17 +68,18 @@ class Pca9685Driver:
                 address.
             WrongDeviceError: another device has its address.
             PortBusyError: another process holds the emulated bus.
-            DeviceFaultError: a channel that should be at rest reads back another value twice in a row; all pulses are
-                off.
+            DeviceFaultError: a channel that should be at rest reads back another value twice in a row, or once while the
+                chip sleeps; all pulses are off.
         """
         config = self._config
         async with await self._port.open() as link:
             session = Pca9685Session(link, self._clock, config.address, config.answer_timeout)
+            self._sent: dict[int, int] = {}
+            """Latest counts sent, by channel."""
+            await self._rest_before_waking(session)
             await session.set_up(config.prescale)
             self._command: SteeringCommand | None = None
             self._stale = self._failing = False
-            self._sent: dict[int, int] = {}
-            """Latest counts sent, by channel."""
             self._misses = Misses()
             await self._write(session, self._more(rest=True))
             ready()
@@ -145,7 +146,21 @@ class Pca9685Driver:
         rest = self._more(rest=True)
         if unruly := [channel for channel in differ if self._sent[channel] == rest.get(channel)]:
             await session.sleep()
-            raise DeviceFaultError(f"{session.name}: channels {unruly} do not come to rest: all pulses are off")
+            raise _unruly(session, unruly)
+
+    async def _rest_before_waking(self, session: Pca9685Session) -> None:
+        """Bring the channels of a chip that sleeps to rest, so that each attempt to restart it moves nothing.
+
+        Raises:
+            DeviceFaultError: see ``run``.
+        """
+        if not await session.asleep():
+            return
+        await session.sleep()  # after power-up it does not increment the register
+        rest = self._more(rest=True)
+        await self._write(session, rest)
+        if unruly := [channel for channel, counts in rest.items() if await session.counts(channel) != counts]:
+            raise _unruly(session, unruly)
 
     async def _poll(self, session: Pca9685Session) -> None:
         asked, config = self._clock.now(), self._config
@@ -182,3 +197,7 @@ class Pca9685Driver:
             )
         )
         self._polled(stamp, received)
+
+
+def _unruly(session: Pca9685Session, channels: list[int]) -> DeviceFaultError:
+    return DeviceFaultError(f"{session.name}: channels {channels} do not come to rest: all pulses are off")

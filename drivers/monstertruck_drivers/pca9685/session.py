@@ -81,6 +81,11 @@ class Pca9685Session:
             )
         return PwmMode1(await self.read(PwmRegister.MODE1)), await self.read(PwmRegister.PRE_SCALE)
 
+    async def asleep(self) -> bool:
+        """Whether the oscillator stands; raises as ``identify``."""
+        mode, _ = await self.identify()
+        return bool(mode & PwmMode1.SLEEP)
+
     async def set_up(self, prescaler: int) -> None:
         """Run the outputs at the configured frequency; pulses that already run at it are not interrupted.
 

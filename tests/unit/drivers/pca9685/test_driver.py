@@ -270,6 +270,29 @@ def test_without_pulses_a_motor_stops_that_does_not_obey_neutral(fault: tuple[st
     on_bench(test, ESC)
 
 
+def test_a_chip_that_sleeps_is_woken_only_once_its_motor_has_come_to_rest():
+    async def test(rig):
+        pulses = set()
+
+        async def watch():
+            while True:
+                pulses.add(rig.pulse(MOTOR))
+                await rig.settle(0.001)
+
+        rig.emulator.signals.inject(f"target_{MOTOR}", "noisy", "40")
+        async with background(watch()):
+            for _ in range(3):
+                with pytest.raises(DeviceFaultError, match="do not come to rest"):
+                    await rig.session()
+        assert pulses == {None}
+        rig.emulator.signals.inject(f"target_{MOTOR}", "off")
+        async with rig.driving():
+            await rig.settle(0.2)
+            assert rig.pulse(MOTOR) == pytest.approx(1500, abs=3)
+
+    on_bench(test, ESC)
+
+
 def test_another_device_may_not_steer():
     async def test(rig):
         ends = {**rig.ends, "steering": None}
