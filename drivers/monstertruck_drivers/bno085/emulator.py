@@ -25,7 +25,8 @@ class Bno085Emulator(FaultyDevice):
     """Streaming unit.
 
     Faults (``inject``): ``frozen on|off`` (repeats one measurement, the index continues), ``silent on|off``,
-    ``bad_checksum N`` (the next N frames), ``skip N`` (N frames are not sent), ``half_frame``, ``reset``.
+    ``inverted on|off`` (yaw counts the other way), ``bad_checksum N`` (the next N frames), ``skip N`` (N frames are not
+    sent), ``half_frame``, ``reset``.
 
     Args:
         clock: time.
@@ -46,7 +47,7 @@ class Bno085Emulator(FaultyDevice):
         self.faults = FaultTable(
             self.name,
             {
-                "frozen|silent on|off": False,
+                "frozen|silent|inverted on|off": False,
                 "bad_checksum|skip N": 0,
                 "half_frame": 0,
                 "reset": self.power_cycle,
@@ -91,6 +92,8 @@ class Bno085Emulator(FaultyDevice):
     def _frame(self, now: int) -> RvcFrame:
         reading = self._source.imu(now)
         turning = reading.angular_velocity[2] + self._drift
+        if self.faults["inverted"]:
+            turning = -turning
         self._yaw += (self._turning + turning) / 2 / RATE
         self._turning = turning
         x, y, z = reading.acceleration

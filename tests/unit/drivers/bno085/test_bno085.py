@@ -119,6 +119,17 @@ def test_a_few_damaged_torn_and_missing_frames_do_no_harm():
     on_bench(test)
 
 
+def test_a_yaw_that_counts_the_other_way():
+    async def test(rig):
+        async with rig.driving():
+            await rig.out.total(20)
+            rig.emulator.inject("inverted", "on")
+            await rig.settle(0.5)
+            assert rig.out.last.angular_velocity.z == pytest.approx(-0.5, abs=0.3)
+
+    on_bench(test)
+
+
 def test_bytes_lost_or_one_at_a_time():
     async def test(rig):
         rig.port.device.faults.lose_rate = 0.02
