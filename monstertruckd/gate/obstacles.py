@@ -33,6 +33,7 @@ from monstertruckd.gate.rear_sonars import RearSonars
 from monstertruckd.gate.samples import age
 from monstertruckd.gate.scan_memory import DRIFT, ScanMemory
 from monstertruckd.gate.sonars import Place
+from monstertruckd.gate.travel_doubt import TravelDoubt
 from monstertruckd.gate.visibility import Sectors, Visibility, travelled
 
 _Steps = tuple[int, int, int]
@@ -194,13 +195,13 @@ class ObstacleGuard:
         """Whether each point (n, 2) in base (m) lies in a lidar's field of view."""
         return np.asarray(np.logical_or.reduce([eye.visibility.covers(points) for eye in self._eyes]))
 
-    def move(self, now: int, twist: Twist2 | None, dt: float) -> None:
-        """Move the body with ``twist`` for the ``dt`` s before ``now`` (ns); None if the motion is unknown."""
+    def move(self, now: int, twist: Twist2 | None, dt: float, doubt: float = 0.0) -> None:
+        """Move the body as ``ScanMemory.move`` does; a ``twist`` of None: the motion is unknown."""
         self._follow_limits()
         if twist is None:
             self.memory.forget()
         else:
-            self.memory.move(now, twist, dt)
+            self.memory.move(now, twist, dt, doubt)
         for sonar in self._sonars.silenced(now):
             self.memory.silence(sonar)
             self._checked = None
@@ -280,16 +281,15 @@ class ObstacleGuard:
         sweep = self._sweep(x, y, turn)
         clearance = self._limits.config.obstacle.side_clearance
         leaving = LEAVING * sweep.distances
-        contacts = [
-            first_contact(self._footprint, sweep.poses, points, clearance, leaving),
-            # Without clearance: their positions may be off by as much.
-            first_contact(self._footprint, sweep.poses, remembered, -self._footprint.padding),
-        ]
+        contacts = [first_contact(self._footprint, sweep.poses, points, clearance, leaving)]
         if x < 0 and not _on_the_spot(x, y):
             contacts.append(first_contact(self._footprint, sweep.poses, echoes, clearance, leaving))
-        return min(
-            (float(sweep.distances[contact - 1]) for contact in contacts if contact is not None), default=math.inf
-        )
+        free = [float(sweep.distances[contact - 1]) for contact in contacts if contact is not None]
+        # Without clearance: their positions may be off by as much.
+        known = first_contact(self._footprint, sweep.poses, remembered, -self._footprint.padding)
+        if known is not None:
+            free.append(max(float(sweep.distances[known - 1]) - self.memory.unsure, 0.0))
+        return min(free, default=math.inf)
 
     def _check_ground(self, twists: frozenset[_Steps], measured: Array) -> None:
         """Update ``known`` and ``known_slowly``, and shorten the free distance of turns on the spot.
@@ -351,7 +351,9 @@ class ObstacleGuard:
 
     def allowed_before_unseen(self, now: int) -> float:
         """Maximum pace that allows a comfortable stop on seen ground, m/s."""
-        return comfortable_speed(self.known - DRIFT, self.delay(now), self._limits.config.obstacle.deceleration)
+        unsure = self.memory.unsure
+        known = self.known if not unsure else min(self.known, self._reach) - unsure
+        return comfortable_speed(known - DRIFT, self.delay(now), self._limits.config.obstacle.deceleration)
 
     def allowed_speed(self, free: float, now: int) -> float:
         """Maximum pace that allows a comfortable stop within ``free`` metres, m/s."""
@@ -395,6 +397,7 @@ class ObstacleCheck(Check):
         super().__init__(view)
         self.guard = ObstacleGuard(view.limits, view.footprint, points, sonars)
         self._approach = Approach(view)
+        self._doubt = TravelDoubt(view.limits, len(view.chassis.shafts))
         self._before_unseen = False
         """Whether the robot is stopped in front of unseen ground."""
 
@@ -409,7 +412,10 @@ class ObstacleCheck(Check):
         if isinstance(seen, Tick):
             # A disarmed robot may be pushed or carried; its memory stays valid while its wheels stand.
             known = view.mode.active or view.samples.at_rest(seen.now)
-            self.guard.move(seen.now, view.samples.twist(seen.now) if known else None, seen.elapsed / SECOND)
+            measured, dt = view.samples.shaft_speeds(seen.now), seen.elapsed / SECOND
+            self._doubt.observe(seen.now, dt, view.motion.shaft_speeds, measured, view.samples.drives)
+            twist = view.samples.twist(seen.now) if known else None
+            self.guard.move(seen.now, twist, dt, self._doubt.distance)
         elif isinstance(seen, LaserScan) and topic in SCANS:
             lidar = SCANS.index(topic)
             if seen is not view.samples.scans[lidar]:

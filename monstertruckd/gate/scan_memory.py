@@ -83,6 +83,8 @@ class _Taken(NamedTuple):
     """Free distance along every beam, m; padded with a 0 before the first and after the last beam."""
     variance: float
     """Variance of the pose in odometry when it was taken, m^2."""
+    doubt: float
+    """Doubt about the travelled distance when it was taken, m."""
     beside: float = DRIFT
     """Margin around the body within which ground counts as free, m."""
 
@@ -141,7 +143,7 @@ class ScanMemory:
         self._distance = distance
         self._time = round(time * SECOND)
         self._variance_kept = deviation**2
-        self._variance = 0.0
+        self._variance = self._travel_doubt = 0.0
         self._rested: LaserScan | None = None
         """First scan since the robot was disarmed or carried; None while it is armed."""
         self.forget()
@@ -157,9 +159,20 @@ class ScanMemory:
             eye.forget()
         self._heard: dict[str, _Heard] = {}
         self._points = np.empty((0, 2))
+        self.unsure = 0.0
+        """Greatest growth of the doubt about the travelled distance since a valid view, beyond the padding of the
+        footprint, m: the body may be that much nearer to what it remembers."""
 
-    def move(self, now: int, twist: Twist2, dt: float) -> None:
-        """Move the body with ``twist`` (m/s, rad/s) for the ``dt`` s before ``now`` (ns)."""
+    def move(self, now: int, twist: Twist2, dt: float, doubt: float = 0.0) -> None:
+        """Move the body.
+
+        Args:
+            now: ns.
+            twist: motion for the ``dt`` s before ``now`` (m/s, rad/s).
+            dt: s.
+            doubt: see ``TravelDoubt.distance``.
+        """
+        self._travel_doubt = doubt
         if twist != STILL:
             self._pose = integrate(self._pose, *twist, dt)
             self._travelled += self._footprint.corner_speed(twist) * dt
@@ -204,6 +217,8 @@ class ScanMemory:
         elif stood[-1:] == [True] or not stood or travelled - taken[-1].travelled >= memory_step:
             taken.append(self._newest)
         _keep(eye.views, self._newest)
+        grown = [abs(self._travel_doubt - view.doubt) for view in self._seeing(self._newest)]
+        self.unsure = max(max(grown) - self._footprint.padding, 0.0)
         self._points = self._hidden(self._newest)
 
     def moved(self, points: Array, lidar: int) -> Array:
@@ -242,7 +257,9 @@ class ScanMemory:
         _, pose, travelled = min(self._ticks, key=lambda tick: abs(tick[0] - beams.stamp), default=present)
         there = _lifted(points, pose)
         (sensor,) = placed(np.array([mount]), pose).tolist()
-        return _Taken(beams, pose, tuple(sensor), travelled, there, np.pad(beams.free, 1), self._variance)
+        return _Taken(
+            beams, pose, tuple(sensor), travelled, there, np.pad(beams.free, 1), self._variance, self._travel_doubt
+        )
 
     def points(self) -> Array:
         """Remembered points outside the view of each lidar's latest scan, in base at the latest, shape (n, 2), m."""

@@ -228,6 +228,8 @@ class Rig:
         self.travelled = 0.0
         self.mode, self.current = DriveMode.ENABLED, None
         """Power state of the drive, and the current that it measures, A."""
+        self.shown = 1.0
+        """Share of its speed that the drive reports."""
         self.driver = None
         self._seq = 0
 
@@ -269,7 +271,7 @@ class Rig:
         samples = {
             "scan": lambda: show(self.gate, scan(self.now, *self.obstacles, unknown=self.unknown)),
             "attitude": lambda: show(self.gate, attitude(self.now, roll=self.tilt, tilt_valid=self.tilt_valid)),
-            "drive": lambda: show(self.gate, feedback(self.now, self.speed, mode, current=self.current)),
+            "drive": lambda: show(self.gate, feedback(self.now, self.shown * self.speed, mode, current=self.current)),
             "steering": lambda: show(self.gate, servos(self.now)),
             "battery": lambda: show(self.gate, battery(self.now, self.level)),
         }

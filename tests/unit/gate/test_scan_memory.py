@@ -593,6 +593,32 @@ def test_in_reverse_the_truck_drives_where_it_came_from_and_stops_before_ground_
     assert rig.x < 0.0
 
 
+@pytest.mark.parametrize("shown", [0.3, 0.7])
+def test_in_reverse_a_drive_that_reports_less_than_it_turns_does_not_pass_the_edge_of_seen_ground(shown):
+    rig = surround(Rig(disarm_after=5.0)).driving(ticks=200, speed=0.2)
+    rig.driver, rig.shown = {"speed": -0.15}, shown
+    rig.tick(400)
+    assert rig.out.reasons == (Reason.UNSEEN_STOP,)
+    assert rig.x > -DRIFT
+
+
+def test_remembered_obstacles_are_nearer_by_the_doubt_about_the_travelled_distance_beyond_the_padding():
+    def beside(doubt):
+        guard, now = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, [ScanPoints(MOUNT)]), SECOND
+        guard.observe(scan(now, (0.3, 0.35)))
+        for _ in range(120):
+            now += TICK
+            guard.move(now, (0.2, 0.0, 0.0), 0.02, doubt)
+        guard.observe(scan(now))
+        return guard.free_distance(((0.0, 1.0, 0.0),))
+
+    free, padding = beside(0.0), FOOTPRINT.padding
+    assert 0.1 < free < 0.3
+    assert beside(padding) == free
+    assert beside(padding + 0.05) == beside(-padding - 0.05) == pytest.approx(free - 0.05)
+    assert beside(10.0) == 0.0
+
+
 def test_ahead_the_gate_slows_down_a_tail_that_swings_towards_unseen_ground():
     assert Reason.UNSEEN_SLOW in surround(Rig()).driving(speed=0.15, rear=0.4, ticks=20).out.reasons
 
