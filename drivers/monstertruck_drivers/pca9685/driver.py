@@ -68,7 +68,7 @@ class Pca9685Driver:
                 address.
             WrongDeviceError: another device has its address.
             PortBusyError: another process holds the emulated bus.
-            DeviceFaultError: a channel that should be at rest reads back another value twice in a row, or once while the
+            DeviceFaultError: a channel that should be at rest reads back another value, twice in a row or while the
                 chip sleeps; all pulses are off.
         """
         config = self._config
