@@ -73,17 +73,17 @@ STOPPED: Final = "the emergency stop is latched until an operator resets it"
 
 
 class Daemon:
-    """One robot; ``run`` it once.
+    """Daemon of one robot; ``run`` it once.
 
     Args:
         config: configuration of the robot.
         clock: wall or virtual time.
         ports: serial ports by device role, instead of the configured ones.
-        computer: its USB tree, kernel files and disk; default: those under ``config.machine``.
-        tree: file and line of every configured value, kept with the log.
-        seed: None for a real run. Otherwise everything random comes from it, nothing arrives from outside and
-            nothing but the log is left: no Zenoh, no latch file. For the virtual clock.
-        environment: what systemd gives a service: socket and watchdog period (``NOTIFY_SOCKET``, ``WATCHDOG_USEC``),
+        computer: USB tree, kernel files and disk of its computer; default: those under ``config.machine``.
+        tree: file and line of every configured value, stored with the log.
+        seed: None for a real run. Otherwise the seed of all random numbers of a run on the virtual clock, without Zenoh
+            and without a latch file; only its log remains.
+        environment: environment variables that systemd sets: ``NOTIFY_SOCKET``, ``WATCHDOG_USEC``,
             ``RUNTIME_DIRECTORY``.
         left_out: unusable files; any of them latches the emergency stop until an operator clears it.
     """

@@ -186,10 +186,10 @@ class ScanMemory:
         self._variance = position_deviation(covariance) ** 2 + lever**2 * float(covariance[8])
 
     def rest(self, scan: LaserScan | None) -> None:
-        """Take a scan of a robot whose wheels stand and that may be carried; forget everything once it was carried.
+        """Process a scan of a robot at rest; discard the memory if the robot was carried.
 
         Args:
-            scan: latest scan; None while the robot is armed, and so not carried.
+            scan: latest scan; None while the robot is armed, because an armed robot is not carried.
         """
         if scan is None or self._rested is None:
             self._rested = scan

@@ -1,4 +1,4 @@
-"""A path as poses in the order in which they are driven: routes, elastic bands, planners' answers."""
+"""A path as a sequence of poses: routes, elastic bands, planners' answers."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -15,7 +15,7 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.plan import Path, Steering
 
 CUSP_REACHED: Final = 0.1
-"""Nearer than this to a cusp of its band the truck continues with what follows (m)."""
+"""Distance to a cusp of its band below which the truck continues with the part after the cusp (m)."""
 
 
 @dataclass(frozen=True)
@@ -52,10 +52,10 @@ class PosePath:
 
     @classmethod
     def of(cls, message: Path) -> "PosePath":
-        """Return the path in a message; ``check_path`` has the further demands of a tracker.
+        """Return the path in a message; ``check_path`` checks the further requirements of a tracker.
 
         Raises:
-            InputError: it is none.
+            InputError: the message contains no valid path.
         """
         if len(message.poses) % 3:
             raise InputError(f"path of {len(message.poses)} numbers: expected rows of x, y, yaw")
@@ -85,7 +85,7 @@ class PosePath:
         )
 
     def then(self, other: "PosePath") -> "PosePath":
-        """These poses and then the other ones; steering, clearance and speeds are left out."""
+        """Return these poses followed by the other ones, without steering, clearance and speeds."""
         return PosePath(np.vstack((self.poses, other.poses)), np.concatenate((self.directions, other.directions)))
 
     @cached_property
@@ -101,12 +101,12 @@ class PosePath:
 
     @property
     def stops(self) -> NDArray[np.intp]:
-        """Indices of the poses at which the robot stops before the end."""
+        """Indices of the poses where the robot stops before the end."""
         return np.flatnonzero(stops(self.directions[1:], self.steering[1:])) + 1
 
 
 def stops(directions: Array, steering: Sequence[Steering]) -> NDArray[np.bool_]:
-    """Whether the robot has to come to rest between each two steps.
+    """Return whether the robot must come to rest between each two steps.
 
     Args:
         directions: shape (n,), +1 or -1 of each step.
@@ -124,7 +124,7 @@ def stops(directions: Array, steering: Sequence[Steering]) -> NDArray[np.bool_]:
 
 
 def _must_stand(before: Steering, after: Steering) -> bool:
-    """Whether the axles turn so far between two different ways of steering that the robot has to stand meanwhile."""
+    """Whether the axles turn so far between two steering modes that the robot must stand meanwhile."""
     return "crab" in (before, after) and "hybrid" not in (before, after)
 
 
@@ -146,7 +146,7 @@ def nearest_pose(band: PosePath, pose: Array) -> int:
 
 
 def direction_runs(directions: Array) -> Iterator[tuple[int, int]]:
-    """Index ranges of one direction; the pose at a cusp, which ends one, also begins the next one."""
+    """Yield the index ranges of one direction; the pose at a cusp belongs to the ranges before and after it."""
     cuts = [*np.flatnonzero(np.diff(directions)).tolist(), len(directions) - 1]
     begin = 0
     for cut in cuts:

@@ -96,7 +96,7 @@ def opened(folder: Path) -> Iterator[MapSave]:
 
 
 def holds_map(folder: Path, run: str) -> bool:
-    """Whether the latest intact save of a grid is of this run."""
+    """Whether ``run`` wrote the latest intact save of a grid."""
     try:
         with opened(folder) as save:
             return save.run == run and save.file(YAML).exists()

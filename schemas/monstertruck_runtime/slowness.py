@@ -85,12 +85,12 @@ class _Measured(Coroutine[Any, Any, T]):
         self._computer = computer
 
     def send(self, value: Any) -> Any:
-        """Run one turn."""
+        """Run the coroutine up to its next await."""
         _module.set(self._name)
         return self._turn(self._work.send, value)
 
     def throw(self, *error: Any) -> Any:
-        """Run one turn that begins with an exception."""
+        """Raise an exception in the coroutine and run it up to its next await."""
         _module.set(self._name)
         return self._turn(self._work.throw, *error)
 

@@ -164,11 +164,14 @@ class BatteryMonitor:
     def take(
         self, stamp: int, received: int, volts: float, *, at_limit: bool = False, current: float | None = None
     ) -> None:
-        """Process one sample (V); ``at_limit``.
+        """Process one voltage sample (V).
 
-        The converter reads 0 or full scale, so a wire of the divider is disconnected.
-
-        ``current`` flows into the pack (A); None if not measured.
+        Args:
+            stamp: time of the sample (ns).
+            received: time of its arrival (ns).
+            volts: voltage of the pack.
+            at_limit: whether the converter reads 0 or full scale, because a wire of the divider is disconnected.
+            current: current into the pack (A); None if not measured.
         """
         verdict = self._judge.update(stamp, float("nan") if at_limit else volts, self._motor_current(stamp))
         level, rest = verdict.level, verdict.rest_voltage

@@ -224,7 +224,7 @@ class SquareModel:
         return Maps((front, rear), self._maps.scales, self._maps.deficit)
 
     def turns(self, legs: Sequence[SteeringRun], parameters: Array) -> Array:
-        """Predict the turns of legs, rad; (n,)."""
+        """Predict the turn of each leg (rad); (n,)."""
         distance, base, offset = parameters
         turns, _ = self._model.predict(legs, self.maps(float(offset)))
         return np.asarray(turns * distance / base)

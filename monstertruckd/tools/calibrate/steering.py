@@ -127,7 +127,7 @@ class SteeringWizard:
 
     @staticmethod
     async def _check_compass(context: WizardContext) -> None:
-        """The compass reports that both axles steer the wrong way: ask the operator whether the compass is wrong.
+        """Ask the operator whether the compass is wrong, because it reports that both axles steer the wrong way.
 
         Raises:
             InputError: the compass is wrong.
@@ -296,7 +296,7 @@ class AxleTravel:
 
     @classmethod
     def of(cls, axle: int, sign: int, legs: Sequence[SteeringRun], model: SteeringModel, maps: Maps) -> "AxleTravel":
-        """Return samples from arcs with strongly turned wheels, as far as ``maps`` give the angle of the other axle."""
+        """Compute the reach from arcs with strongly turned wheels; ``maps`` give the angle of the other axle."""
         reached, meant = np.array([model.reached(leg, maps, axle) for leg in legs]).mean(axis=0).tolist()
         stopped = sign * (meant - reached) > SHORT
         servo = reached if stopped else meant

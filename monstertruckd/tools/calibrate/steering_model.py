@@ -99,7 +99,7 @@ class SteeringRun:
     turn: float
     """Turn measured between the rests, rad, left positive."""
     sigma: float
-    """Standard deviation of ``turned``, rad."""
+    """Standard deviation of ``turn``, rad."""
     offset: float | None = None
     """Offset from the string at the end, m, left positive; None if not measured."""
     offset_sigma: float = 0.01

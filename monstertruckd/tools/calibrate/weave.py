@@ -33,7 +33,7 @@ ANGLE: Final = 0.12
 
 
 def weaves(rounds: int) -> list[MoveStep]:
-    """Number of weaves, alternately forward and back."""
+    """Return the moves of ``rounds`` weaves, alternately forward and back."""
     return [
         # Seconds between changes of side: many changes determine the lag, a long arc the gain. Evenly spaced changes
         # could not separate them.

@@ -70,7 +70,7 @@ def station(
 ) -> None:
     """Serve the operator's page on this machine: map, state, goals, driving, emergency stop.
 
-    It is a client of the robots like any other, and asks nothing of the internet. Beyond the loopback
+    It is a client of the robots like any other, and needs no internet connection. Beyond the loopback
     interface the page is served by TLS only, and to users who log in.
     """
     import asyncio

@@ -48,9 +48,9 @@ AUTHORITY_DAYS: Final = 3650
 ROBOT_DAYS: Final = 825
 PORT: Final = 7447
 ROUTER_FILE: Final = "router.pem"
-"""Certificate of the authority of the fleet's router, if there is one."""
+"""Certificate of the authority of the fleet's router, absent without a router."""
 PLACE: Final = Path("/etc/monstertruckd/security")
-"""Where the robot keeps its files."""
+"""Folder of the robot's security files, on the robot."""
 
 WRITTEN: Final = "# Written by `monstertruckd security`; include it in the robot's configuration.\n"
 FIRST: Final[dict[str, Any]] = {"robot": ROBOT, "addresses": ("localhost", "127.0.0.1")}
@@ -69,10 +69,10 @@ class CertifiedStation(Schema):
 
 
 class TrustedRouter(Schema):
-    """A router of the fleet to which the robot connects."""
+    """Router of the fleet that the robot connects to."""
 
     name: OwnerName
-    """Common name of its certificate."""
+    """Common name of the router's certificate."""
     endpoint: str
 
 
@@ -83,7 +83,7 @@ class CertificateRegister(Schema):
     addresses: tuple[str, ...] = Field(min_length=1)
     """Addresses and host names of the robot."""
     place: Path = PLACE
-    """Where the robot keeps its files."""
+    """Folder of the robot's security files, on the robot."""
     stations: dict[OwnerName, CertifiedStation] = {}
     router: TrustedRouter | None = None
 
@@ -103,7 +103,7 @@ class CertificateRegister(Schema):
         return self
 
     def of_role(self, *roles: AccessRole) -> tuple[str, ...]:
-        """Names with one of these roles."""
+        """Return the names of stations with one of these roles."""
         return tuple(name for name, station in self.stations.items() if station.role in roles)
 
 
@@ -115,7 +115,7 @@ class Expiry:
     role: str
     rank: str
     days: int | None
-    """Until it expires; negative = since then; None: its file is not here."""
+    """Time until the certificate expires; negative after its expiry; None: its file is not in the folder."""
 
 
 class Folder:

@@ -203,7 +203,7 @@ def suspects(
         rows = [row for row in found if row.quantity is quantity]
         doubtful = {measure for row in rows for measure in (row.one, row.other)} - partnered
         if Measure.COMPASS in doubtful and len(doubtful) > 1:
-            # Iron nearby turns a needle further than its error: a compass alone accuses no other measure.
+            # Iron nearby deflects a needle by more than its stated error: a compass alone casts no doubt on others.
             rows = [row for row in rows if Measure.COMPASS not in (row.one, row.other)]
             doubtful &= {measure for row in rows for measure in (row.one, row.other)}
         by_quantity[quantity] = {

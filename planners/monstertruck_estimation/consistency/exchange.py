@@ -40,7 +40,7 @@ class StepInput:
     claim: Claim | None = None
     lag: LagQuestion | None = None
     rest: Claim | None = None
-    """Claim that the robot stands, as far as its wheels do."""
+    """Claim that the body moves no more than its wheels."""
     rolled: Pose2 | None = None
     """Motion by the wheels since the previous scan; None if unknown."""
     slip: float = ConsistencyConfig().slip

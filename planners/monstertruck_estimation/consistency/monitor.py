@@ -211,7 +211,7 @@ class ConsistencyMonitor:
     # Conclusions
 
     def activate(self, now: int | None) -> None:
-        """Drop the findings about motion, armed at ``now`` (ns); None: disarmed, nothing is compared."""
+        """Drop the findings about motion when the robot is armed at ``now`` (ns); None stops the comparisons."""
         self._active_since = now
         self._pending, self._doubted = None, frozenset()
         self._steps.clear()

@@ -2,7 +2,7 @@
 
 A sensor whose noise has a standard deviation of at least 0.6 digits gives its most frequent value with a
 probability of at most 0.6 (normal distribution): 40 equal values in a row happen once in 10^9. The detector learns a
-value's noise while the robot stands. A value without noise may stay the same for hours; it is never accused.
+value's noise while the robot stands. A value without noise may stay the same for hours; the detector never reports it.
 """
 
 import math

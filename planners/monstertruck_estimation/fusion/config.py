@@ -29,7 +29,7 @@ class WheelTrust(Schema):
 
 
 class HeadingTrust(Schema):
-    """Noise model of the compass, and the gates that leave it out."""
+    """Noise model of the compass, and the limits beyond which its headings are rejected."""
 
     noise: Positive = 0.02
     """Standard deviation of a heading (rad)."""
@@ -53,13 +53,13 @@ class ScanTrust(Schema):
     """Noise model of the motion between scans."""
 
     scale: Positive = 1.0
-    """Factor on the standard deviation that the matching claims."""
+    """Factor on the standard deviation that the scan matcher states."""
     drift: tuple[NotNegative, NotNegative] = (0.0005, 0.0005)
     """Standard deviation of the drift, per scan, of the map against which scans are matched (m, rad)."""
 
 
 class ImuTrust(GyroConfig):
-    """Noise model of an inertial measurement unit's yaw rate, and the gates that leave it out."""
+    """Noise model of an inertial measurement unit's yaw rate."""
 
     noise: Positive = 0.005
     """Standard deviation of its turn, including its bias (rad per root second)."""

@@ -395,7 +395,10 @@ def _is_small(window: tuple[float, float]) -> bool:
 def _contradiction(
     keyframes: KeyframeMap, own: NDArray[np.intp], newest: int, near: NDArray[np.intp], pose: Array
 ) -> float:
-    """Return the share of points of ``own`` and ``near`` that the others look through, with ``newest`` at ``pose``."""
+    """Return the share of points of ``own`` and ``near`` that beams of the others pass through.
+
+    Keyframe ``newest`` is assumed to be at ``pose``.
+    """
     placed = compose(pose, between(keyframes.poses[newest], keyframes.poses[own]))
     mine, theirs = ([keyframes.frames[k].scan for k in numbers] for numbers in (own, near))
     return contradiction(mine, placed, theirs, keyframes.poses[near])

@@ -54,7 +54,7 @@ class Edges:
         return Edges(number[self.origin], number[self.target], self.measured, self.information, self.loop)
 
     def joined(self, other: "Edges") -> "Edges":
-        """Return the edges of both."""
+        """Return the edges of both graphs."""
         return Edges(
             np.concatenate((self.origin, other.origin)),
             np.concatenate((self.target, other.target)),

@@ -118,7 +118,7 @@ class PlannerConfig(Schema):
     blocked_scans: Annotated[int, Field(ge=1)] = 3
     """Number of consecutive scans that must show the path blocked."""
     recovery: Annotated[tuple[Recovery, ...], Field(strict=False)] = ("clear", "back_out", "wait", "replan")
-    """Recovery behaviours, tried in turn before the goal is given up"""
+    """Recovery behaviours, tried in turn before the goal fails"""
     wait: Positive = 5.0
     """Duration of the behaviour "wait" (s)."""
     recovered: Positive = 0.5

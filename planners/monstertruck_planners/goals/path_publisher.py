@@ -1,4 +1,4 @@
-"""Paths for the tracker: publishing, checking against scans, early end; and standstill without disarming."""
+"""Publish paths for the tracker, check them against scans, end them early, and request standstill without disarming."""
 
 import contextlib
 from dataclasses import dataclass

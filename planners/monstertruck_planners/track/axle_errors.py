@@ -26,7 +26,7 @@ from monstertruck_kinematics.truck import FourWheelSteering
 Angles = tuple[float, float]
 
 BASE: Final = 0.25
-"""Minimum time between two compared poses (s): the noise of single poses hardly matters any more."""
+"""Minimum time between two compared poses (s), so that the noise of single poses hardly matters."""
 
 DEAD_BAND: Final = 0.0012
 """Standard deviation of the servo's stop position (rad of the axle): a dead band of 2 us to either side, uniformly."""
@@ -220,7 +220,7 @@ class AxleErrorEstimator:
         tangents, by_axle = [], []
         for q, angle in zip(asked, self.errors.wheels(asked, grip), strict=True):
             tangents.append(math.tan(min(max(angle, -1.4), 1.4)))  # 1.4: angles are cut to this, rad
-            # As of exact axles: with the estimate's own noise in the changes the filter would believe to learn from it.
+            # Slope of exact axles: with the estimated axles, the filter would learn from the noise of its own estimate.
             slope = 1.0 + math.tan(min(max(q, -1.4), 1.4)) ** 2
             by_axle.append(slope * np.array((q, 1.0, -acceleration)))
         shares = ((1.0 / geometry.wheelbase, -1.0 / geometry.wheelbase), (1.0 - geometry.cg_split, geometry.cg_split))

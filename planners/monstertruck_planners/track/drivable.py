@@ -141,7 +141,7 @@ def _run_bends(points: Array, radius: float, tolerance: float) -> Iterator[Bend]
 
 
 def _excess(heading: Array, s: Array, radius: float) -> Array:
-    """Return by how much each step turns further from any earlier step than the body can between both (rad)."""
+    """Return the turn of each step beyond what the body can turn between any earlier step and this one (rad)."""
     excess = np.zeros(len(heading))
     for side in (heading, -heading):
         earlier = np.minimum.accumulate(side[:-1] - s[1:-1] / radius)

@@ -60,7 +60,7 @@ class Lqr(PathTracker[LqrConfig]):
 
     def _reference(self, state: TrackingState) -> Array:
         """Return slip and turn of the next periods, shape (2 k,)."""
-        # The path after a change of steering is not for these axles: plan as if the path continued unchanged.
+        # The path after a change of steering does not apply to these axles: plan as if the path continued unchanged.
         # 0.03: a change of steering, m: more than the spacing of the reference
         end = state.reference.section_end(state.s) - 0.03
         ahead = state.reference.at(np.minimum(state.distances(self._times), end))
@@ -107,7 +107,7 @@ class GainTable:
         q = np.zeros((n + m, n + m))
         q[0, 0] = period / config.lateral_scale**2
         q[1, 1] = period / config.heading_scale**2
-        if steering == "crab":  # the heading is given: nothing can be done about it
+        if steering == "crab":  # the path sets the heading, and no input changes it
             q[1, 1] = a[0, 1] = 0.0
             a[1, :] = 0.0
         r = np.eye(m) / (period * config.rate_scale**2)

@@ -459,8 +459,8 @@ class PathTracker(ABC, Generic[C]):
         if last:
             reached = away <= config.goal_tolerance and turned <= config.goal_yaw_tolerance
             return Reason.GOAL_REACHED if reached else Reason.GOAL_MISSED
-        # 0.5: usable share of the clearance at a cusp; the rest is for the motion after it 0.01: minimum tolerance at a
-        # cusp, m
+        # 0.5: usable share of the clearance at a cusp; the rest is for the motion after it. 0.01: minimum tolerance at
+        # a cusp, m
         tolerance = max(0.5 * run.clearance, 0.01)
         # A corner moves by about one wheelbase per radian.
         off = away + self.geometry.wheelbase * turned

@@ -191,7 +191,7 @@ class ResponseEstimator:
         xx, xy = xx + by_gain, xy + by_gain
         explained = (xy * (dd * xy - 2 * self._yd * xd) + self._yd**2 * xx) / (xx * dd - xd * xd)
         most = float(explained.max())
-        believed = 5.0  # turns that this is worth
+        believed = 5.0  # weight of the prior noise, in turns
         self._variance = (self._yy + by_gain - most + believed * TURN_NOISE**2) / (self._count + believed)
         # 3.0: turns equivalent to one independent turn: model errors last longer than a step
         cost = (most - explained) / (2 * self._variance * 3.0) + self._prior

@@ -134,7 +134,7 @@ class PathRun:
 
 
 def _nearest_step(steps: Array, x: float, y: float, low: float, high: float) -> list[int]:
-    """Return the nearest point for runs of many steps, as above."""
+    """Return the index of the step nearest to the point, as a list of one, for runs of many steps."""
     px, py, dx, dy, length, begin, _ = steps.T
     along = np.minimum(np.maximum(((x - px) * dx + (y - py) * dy) / length, 0.0), length)
     share = (np.minimum(np.maximum(begin + along, low), high) - begin) / length
@@ -392,7 +392,7 @@ class RunStates:
         return self.steering(s) != "crab"
 
     def steerings(self, s: Array) -> list[Steering]:
-        """Whether the path prescribes the body yaw at several places."""
+        """Return the steering mode at each of the positions ``s`` (m)."""
         return self._modes(s) if self.given else [self._default] * len(s)
 
     def at(self, s: Array) -> ReferenceStates:
