@@ -22,7 +22,7 @@ class Misses:
     """Context for consecutive exchanges: suppresses errors of the answer, except the last of ``limit`` in a row.
 
     Args:
-        limit: consecutive exchanges without a usable answer after which the session ends.
+        limit: maximum number of consecutive exchanges without a usable answer; then the session ends.
     """
 
     def __init__(self, limit: int = MISSES) -> None:

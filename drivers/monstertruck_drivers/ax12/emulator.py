@@ -195,7 +195,7 @@ class Ax12Bus(FaultyDevice):
         while True:
             data = await end.read()
             now = self._clock.now()
-            if now - heard > 100_000_000:  # silence inside a packet after which a unit drops it (ns)
+            if now - heard > 100_000_000:  # timeout inside a packet (ns); then a unit drops it
                 parser = Ax12Parser()
             heard = now
             self.received.extend(data)

@@ -20,7 +20,7 @@ class Bno085Config(Schema):
     delay: Annotated[float, Field(ge=0, le=0.5)] = 0.006
     """Delay from the measurement to the last byte of its frame (s): 19 bytes and the unit's filter"""
     silence: Annotated[float, Field(gt=0, le=10)] = 0.3
-    """Seconds without a frame after which the session ends"""
+    """Timeout without a frame (s); then the session ends"""
     stuck_after: Annotated[int, Field(ge=2, le=10_000)] = 100
     """Number of consecutive frames with an identical acceleration after which the session ends: real sensors have
     noise

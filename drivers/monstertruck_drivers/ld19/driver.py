@@ -47,7 +47,7 @@ class PacketSamples:
         self._stamp: int | None = None
 
     def of(self, packets: list[Ld19Packet]) -> BeamSamples:
-        """Return the samples of consecutive packets, without those of a stationary head."""
+        """Return the samples of consecutive packets; drop samples of a stationary head."""
         kept, ends = [], []
         for packet in packets:
             if self._stamp is not None:

@@ -28,7 +28,7 @@ class MjpegConfig(Schema):
     most: Annotated[int, Field(ge=10_000, le=10_000_000)] = 2_000_000
     """Maximum length of a picture (bytes)"""
     watchdog: Annotated[float, Field(gt=0, le=60)] = 5.0
-    """Time without a complete picture after which the session ends (s); it includes a program's start of its camera"""
+    """Timeout without a complete picture (s), including the start of the camera by a program; then the session ends"""
     frame: FrameId = "camera"
     """Frame of the pictures"""
     lens: LensConfig = LensConfig()

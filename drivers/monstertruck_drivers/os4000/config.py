@@ -51,7 +51,7 @@ class Os4000Config(Schema):
     delay: Annotated[float, Field(ge=0, le=1)] = 0.04
     """Age of a measurement when its last byte arrives (s): 80 bytes at 19200 baud."""
     silence: Positive = 0.5
-    """Time without a valid sentence after which the session ends (s); at least five periods."""
+    """Timeout without a valid sentence (s), at least five periods; then the session ends."""
     field_strength: Positive | None = None
     """Magnitude of the magnetic field at the place of calibration (microtesla); None: not checked."""
     field_tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.25
@@ -73,5 +73,5 @@ class Os4000Config(Schema):
 
     @property
     def timeout(self) -> float:
-        """Time without a valid sentence after which the session ends (s)."""
+        """Timeout without a valid sentence (s); then the session ends."""
         return max(self.silence, 5 / self.rate)

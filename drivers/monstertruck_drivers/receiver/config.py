@@ -32,7 +32,7 @@ class ReceiverConfig(Schema):
     settle: Annotated[int, Field(ge=1, le=20)] = 3
     """Consecutive frames with a switch on before it takes effect; off takes effect at once"""
     silence: Annotated[float, Field(gt=0, le=2)] = 0.2
-    """Time without channels after which the transmitter is lost (s)"""
+    """Timeout without channels (s); then the transmitter counts as lost"""
 
     @model_validator(mode="after")
     def _each_once(self) -> Self:

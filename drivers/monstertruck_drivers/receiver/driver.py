@@ -156,7 +156,7 @@ class ReceiverDriver:
                     heard = self._clock.now()
                 except (DeviceTimeoutError, ProtocolError):
                     frames = []
-                    if self._clock.now() - heard > 1.0 * SECOND:  # seconds without a byte after which the session ends
+                    if self._clock.now() - heard > 1.0 * SECOND:  # timeout without a byte (s)
                         raise
 
     def _publish(self, hand: Hand, newest: HandControls | None) -> HandControls:

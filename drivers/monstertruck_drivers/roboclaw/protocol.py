@@ -16,7 +16,7 @@ ADDRESSES: Final = (0x80, 0x87)
 """Lowest and highest address."""
 LONGEST_NAME: Final = 48
 PACKET_GAP: Final = 0.01
-"""Silence after which the unit drops a partial request (s)."""
+"""Timeout of a partial request in the unit (s)."""
 COUNTER: Final = 1 << 32
 _COUNTS: Final = struct.Struct(">II")
 _CRC: Final = struct.Struct(">H")

@@ -67,7 +67,7 @@ class Srf08Config(Schema):
     timeout: Annotated[float, Field(gt=0, le=1)] = 0.05
     """Timeout of the USB-ISS's answer (s)"""
     silence: Annotated[float, Field(gt=0, le=10)] = 1.0
-    """Time without an answer from any sonar after which the session ends (s)"""
+    """Timeout without an answer from any sonar (s); then the session ends"""
     stuck_after: Annotated[int, Field(ge=2, le=10_000)] = 20
     """Number of consecutive echoes that are equal to the microsecond after which a sonar is reported as not
     answering

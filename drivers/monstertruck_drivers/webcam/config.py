@@ -19,7 +19,7 @@ class WebcamConfig(Schema):
     rate: Annotated[float, Field(gt=0, le=120)] = 15.0
     """Picture rate (Hz); the camera uses the nearest rate it offers"""
     watchdog: Annotated[float, Field(gt=0, le=60)] = 2.0
-    """Time without a complete picture after which the session ends (s): a stuck camera reports no error"""
+    """Timeout without a complete picture (s), because a stuck camera reports no error; then the session ends"""
     buffers: Annotated[int, Field(ge=2, le=32)] = 4
     """Number of pictures that the kernel may buffer"""
     frame: FrameId = "camera"

@@ -90,7 +90,7 @@ class WebcamDriver:
     Args:
         config: mode and watchdog.
         source: the camera: ``V4l2Source`` or ``RenderedSource``.
-        clock: time; a real camera's stamps are times of CLOCK_MONOTONIC, like those of the wall clock.
+        clock: time; a real camera's stamps are times of CLOCK_MONOTONIC, as on the wall clock.
         out: pictures.
         events: deviating modes, rejected pictures, unused stamps.
         name: service name.

@@ -17,7 +17,7 @@ class Wt61Config(Schema):
     delay: Annotated[float, Field(ge=0, le=0.5)] = 0.008
     """Age of a measurement when its last byte arrives (s): 33 bytes and the unit's filter"""
     silence: Annotated[float, Field(gt=0, le=10)] = 0.3
-    """Time without a measurement after which the session ends (s)"""
+    """Timeout without a measurement (s); then the session ends"""
     stuck_after: Annotated[int, Field(ge=2, le=10_000)] = 50
     """Number of consecutive identical measurements after which the session ends: real sensors have noise"""
     correction: ImuCorrection = ImuCorrection()

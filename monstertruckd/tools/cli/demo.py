@@ -126,7 +126,7 @@ def _progress(*, screen: bool) -> "Iterator[Report]":
 
 
 def fresh(folder: Path) -> Path:
-    """Return ``folder``, or the first of ``folder-2``, ``folder-3`` ... that does not exist, as no run overwrites another."""
+    """Return the first of ``folder``, ``folder-2``, ``folder-3`` ... that does not exist."""
     names = itertools.chain([folder], (folder.with_name(f"{folder.name}-{n}") for n in itertools.count(2)))
     return next(name for name in names if not name.exists())
 

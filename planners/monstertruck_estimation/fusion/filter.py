@@ -360,7 +360,7 @@ def _heading(state: FilterState, heading: HeadingMeasurement, config: FusionConf
 
 
 def _own_turn(state: FilterState, stamp: int, config: FusionConfig) -> float:
-    """Return the maximum turn (rad) that slipping wheels may miss since the last used heading; 0 if a sensor measured it."""
+    """Return the maximum turn (rad) that slipping wheels missed since the last used heading; 0 if it was measured."""
     if any(stamp - state.used[name] <= TILT_VALID for name in TURNED_BY if name in state.used):
         return 0.0
     return config.max_turn * (stamp - state.used.get("compass", stamp)) / SECOND

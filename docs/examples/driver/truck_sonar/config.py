@@ -12,4 +12,4 @@ class Mb7360Config(Schema):
 
     kind: Literal["mb7360"] = "mb7360"
     timeout: Annotated[float, Field(gt=0, le=10)] = 1.0
-    """Time without a reading after which the session ends (s)"""
+    """Timeout without a reading (s); then the session ends"""
