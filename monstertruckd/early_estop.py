@@ -57,7 +57,7 @@ def send_estop(robot: str, endpoint: str, timeout: float) -> zenoh.Session:
 
 @contextmanager
 def early_estop(arguments: Sequence[str]) -> Iterator[None]:
-    """Send an emergency stop by the arguments of ``estop``; the session is open while the context lasts.
+    """Send an emergency stop with the arguments of ``estop``; the session stays open inside the context.
 
     Failures are left to the ordinary command, which repeats the order and reports them.
     """

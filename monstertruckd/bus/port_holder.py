@@ -62,7 +62,7 @@ def _user(number: int) -> str:
 
 
 def _inodes(endpoint: str, proc: Path) -> Iterator[str]:
-    """Sockets that listen at an endpoint, by the kernel's numbers."""
+    """Yield the kernel's inode numbers of the sockets that listen at an endpoint."""
     if endpoint.startswith(UNIX):
         path = endpoint.removeprefix(UNIX)
         rows = _rows(proc / "net" / "unix")

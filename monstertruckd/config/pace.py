@@ -1,7 +1,7 @@
-"""Settings outside of the gate that must match its speed; the message names each that does not.
+"""Check the settings outside the gate that must match its speed; the message names each that does not.
 
-At a higher speed the robot would fail later: its pose would stop following it, or its route would end in an unseen
-obstacle. Speeds in m/s, distances in m.
+With a mismatch the robot would fail later, at a higher speed: its estimated pose would no longer follow its motion, or
+its route would end in an unseen obstacle. Speeds in m/s, distances in m.
 """
 
 from collections.abc import Iterator

@@ -148,7 +148,7 @@ class BlackBoxFolder:
 
 @dataclass(slots=True)
 class _Pending:
-    """Box that is written once its time has come."""
+    """Black box that is to be written at the time ``due``."""
 
     name: str
     reason: Reason

@@ -63,7 +63,7 @@ def least_squares(
 def _solve(
     residual: Callable[[Array], Array], start: Array, lower: Array, upper: Array, huber: float | None, iterations: int
 ) -> tuple[Array, Array]:
-    """Optimum and its residuals."""
+    """Return the optimum and its residuals."""
     point = np.array(start, dtype=np.float64)
     if ((point < lower) | (point > upper)).any():
         raise KinematicsError(f"start {point.tolist()} is outside the bounds")

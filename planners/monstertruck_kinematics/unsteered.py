@@ -132,7 +132,7 @@ class SkidSteer:
         )
 
     def wheels(self, command: Sequence[float]) -> tuple[Wheel, ...]:
-        """Four fixed wheels where the sides' centres lie: without slip they could only go straight."""
+        """Four fixed wheels at the centres of the sides; without slip, they could only drive straight."""
         unpacked(command, self.inputs)
         return tuple(
             FixedWheel(name, x, y, self.radius)

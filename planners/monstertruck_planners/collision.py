@@ -426,7 +426,7 @@ class DistanceField:
             self._unseen = self._distances(ground), ground
 
     def same_place(self, shape: tuple[int, ...], resolution: float, origin: tuple[float, float, float]) -> bool:
-        """Whether this field is of a grid of that shape (with its ring), resolution and origin."""
+        """Whether this field belongs to a grid with this shape (including the ring), resolution and origin."""
         return (self._occupied.shape, self.resolution, self.origin) == (shape, resolution, origin)
 
     def _compute(self) -> None:
@@ -497,7 +497,7 @@ class DistanceField:
         return np.where(inside, low * (1 - fr) + high * fr, 0.0)
 
     def _cells(self, points: Array) -> tuple[Array, Array]:
-        """Fractional (column, row) of the ringed grid, whole at cell centres."""
+        """Fractional (column, row) indices in the grid with its ring; integers at cell centres."""
         x, y, yaw = self.origin
         dx, dy = points[..., 0] - x, points[..., 1] - y
         c, s = math.cos(yaw), math.sin(yaw)

@@ -60,27 +60,27 @@ class Task(Protocol[R_contra, P, S_co]):
 
     @property
     def running(self) -> bool:
-        """Whether one runs."""
+        """Whether a task runs."""
 
     @property
     def resumable(self) -> bool:
-        """Whether a restart of the daemon interrupted one, which can be resumed or given up."""
+        """Whether a restart of the daemon interrupted a task that can be resumed or abandoned."""
 
     def accept(self, request: R_contra) -> P:
-        """Check a request to start one; nothing has changed if it is refused.
+        """Check a request to start a task; a refused request changes nothing.
 
         Raises:
-            TruckError: it cannot be done now, or not at all.
+            TruckError: the task is impossible, now or at any time.
         """
 
     def begin(self, accepted: P, request: R_contra, number: int) -> None:
         """Start the accepted task."""
 
     def control(self, request: R_contra) -> None:
-        """Pause, resume or stop the one that runs, or give up the one that can be resumed.
+        """Pause, resume or stop the running task, or abandon the one that can be resumed.
 
         Raises:
-            RequestRefusedError: why not.
+            RequestRefusedError: the state of the task does not allow this.
         """
 
     def state(self, now: int) -> S_co:

@@ -30,7 +30,7 @@ _module: ContextVar[str | None] = ContextVar("module", default=None)
 
 
 def factor_of(slowness: float | Board) -> float:
-    """Factor as a number, or of a named board."""
+    """Return the factor, given as a number or by the name of a board."""
     return slowness if isinstance(slowness, float) else BOARDS[slowness]
 
 

@@ -191,7 +191,7 @@ class Verb(StrEnum):
 
     @property
     def moves(self) -> bool:
-        """Whether the robot may start to drive because of it."""
+        """Whether the order may start a motion of the robot."""
         return self in (Verb.START, Verb.RESUME)
 
 

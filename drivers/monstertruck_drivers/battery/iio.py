@@ -149,7 +149,7 @@ def _number(file: Path) -> float:
 
 
 def _shared(folder: Path, stem: str, attribute: str) -> float | None:
-    """Attribute of a channel, or the common one of all voltages."""
+    """Return an attribute of a channel, or the attribute that all voltage channels share."""
     for file in (folder / f"{stem}_{attribute}", folder / f"in_voltage_{attribute}"):
         if file.exists():
             return _number(file)

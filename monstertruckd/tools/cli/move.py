@@ -50,8 +50,8 @@ def move(
 ) -> None:
     """Drive an arc, straight, sideways or on the spot, given by --length or --angle.
 
-    Options left out are settings of the configuration's behaviour `move`. Ends at the end of the move, or with the
-    reason why it was refused or given up. Ctrl-C stops it.
+    Omitted options take the values of the behaviour `move` in the configuration. The command ends with the move, or
+    with the reason why it was refused or abandoned. Ctrl-C stops it.
     """
     from monstertruck_planners.behave.move import MoveConfig
     from monstertruckd.tools.cli.runs import run_behaviour

@@ -1,4 +1,4 @@
-"""Commands of the service: install it into systemd and udev, take it out again."""
+"""Commands of the service: install it into systemd and udev, and remove it."""
 
 import shlex
 import signal

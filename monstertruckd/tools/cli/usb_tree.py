@@ -25,10 +25,10 @@ STATE_STYLE = {
 
 
 async def robot_tree(client: TruckClient) -> tuple[UsbNode, ...]:
-    """Tree a running robot published last.
+    """Return the latest USB tree that a running robot published.
 
     Raises:
-        NotFoundError: it watches no USB tree.
+        NotFoundError: the robot does not watch its USB tree.
     """
     tree = await client.get_retained(USB)
     if tree is None:
@@ -37,7 +37,7 @@ async def robot_tree(client: TruckClient) -> tuple[UsbNode, ...]:
 
 
 async def local_tree(clock: Clock) -> tuple[UsbNode, ...]:
-    """Tree of this machine as it is now; roles and replugs are known to a daemon only."""
+    """Return the current USB tree of this machine; only a daemon knows roles and replugs."""
     hubs = HubCoordinator(UsbConfig(), {}, clock, lambda *_, **__: None)
     hubs.update(read_tree(Sysfs()))
     return hubs.tree()

@@ -36,11 +36,11 @@ def export_ros2(
     """Write a ROS 2 bag (MCAP storage, CDR).
 
     Returns:
-        The bag by topic of the log; it is not created if no message is selected.
+        For every exported topic of the log, the path of the bag. No bag is created if no message is selected.
 
     Raises:
         NotFoundError: no such log.
-        InputError: not a log, a message in it is invalid, or ``output`` exists or cannot be written.
+        InputError: ``path`` is not a log or contains an invalid message, or ``output`` exists or cannot be written.
     """
     reader = open_log(path)
     offset = real_offset(reader)

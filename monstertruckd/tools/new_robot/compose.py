@@ -162,7 +162,7 @@ def _drives(answers: Answers, chassis: Chassis) -> Section:
 
 
 def _axles(answers: Answers, chassis: Chassis) -> Section:
-    """Servos of the axles; the truck's linkage has its own, which are the drivers' defaults."""
+    """Return the servo settings of the axles; those of the truck's linkage are the drivers' defaults."""
     if not chassis.steered:
         return {}
     if answers.body == "truck":
@@ -192,7 +192,7 @@ def _longest(answers: Answers) -> float:
 
 
 def _pack(cells: int) -> Section:
-    """A pack of that many cells, by the limits of a cell in the default pack."""
+    """Return the settings of a pack with ``cells`` cells, scaled from the limits of the default pack."""
     usual = PackConfig()
     names = (*BY_CELLS, "plausible_min")
     volts: Section = {name: round(getattr(usual, name) / usual.cells * cells, 2) for name in names}

@@ -26,11 +26,11 @@ def write_robot(answers: Answers, parent: Path, tree: TreeSnapshot) -> Path:
 
     Args:
         answers: description of the robot.
-        parent: gets the folder, named as the robot.
+        parent: folder in which the robot's folder is created, with the robot's name.
         tree: USB devices of this computer.
 
     Raises:
-        InputError: the folder exists or cannot be made, or no robot can be as described.
+        InputError: the folder exists or cannot be created, or the description is impossible.
     """
     folder = parent / answers.name
     if folder.exists():

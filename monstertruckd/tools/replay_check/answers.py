@@ -107,7 +107,7 @@ class ReplayedActors(ActorFactory):
         self._paced, self._record, self._book = clock, record, book
 
     def actor(self, placement: Placement, name: str, target: str, *, latency: float, **limits: Any) -> Actor:
-        """Return an actor in the loop, wherever it ran in the recorded run."""
+        """Return an actor that runs in the event loop, even if it ran elsewhere in the recorded run."""
         how = target, self._paced, self._record, self._book, latency
         match name:
             case "planning":

@@ -56,10 +56,10 @@ class StraightPasses:
 
 
 def circle(times: Array, poses: Array) -> Circle:
-    """Fit a circle with an evenly moving centre.
+    """Fit a circle whose centre moves at constant velocity.
 
-    The heading is measured, so that the position is linear in all that is requested: centre, drift, and the arm from
-    the centre to the robot, which turns with it.
+    Because the heading is measured, the position is linear in the unknowns: the centre, its drift, and the arm from
+    the centre to the robot, which turns with the robot.
 
     Args:
         times: shape (n,), s, increasing.

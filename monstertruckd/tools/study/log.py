@@ -37,12 +37,12 @@ class Run:
 
     @property
     def straight(self) -> bool:
-        """Whether it goes to and fro."""
+        """Whether both sides turn at the same rate, so that the robot drives straight."""
         return abs(self.left - self.right) < EQUAL
 
     @property
     def name(self) -> str:
-        """In words."""
+        """Description in words."""
         fast, slow = max(abs(self.left), abs(self.right)), min(abs(self.left), abs(self.right))
         if self.straight:
             return f"line, {fast:.2f} rad/s"

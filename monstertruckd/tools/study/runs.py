@@ -91,7 +91,7 @@ def shaft_rates(config: TruckConfig, stretch: Stretch) -> tuple[float, ...]:
     """Rates of the body's shafts.
 
     Raises:
-        InputError: it has no left and right side.
+        InputError: the body has no left and right side.
     """
     if config.body.kind not in ("skid_steer", "differential"):
         raise InputError(f"body {config.body.kind}: expected one with a left and a right side, such as skid_steer")

@@ -61,7 +61,7 @@ def front_of(kind: str) -> tuple[str, KissFront | None]:
 
 
 class ScanMotionStep:
-    """Motion from scan to scan."""
+    """Computes the motion between consecutive scans."""
 
     def __init__(self) -> None:
         self._front: tuple[str, KissFront | None] | None = None

@@ -416,9 +416,10 @@ def crossings(keyframes: KeyframeMap, own: NDArray[np.intp], others: NDArray[np.
     """Compare the latest keyframes of ``own`` with those of ``others`` around them.
 
     Returns:
-        Shape (k, 2), one row per keyframe in their order: points that the opposite side looked through, and points in
-        its view. An own point is looked through if more of the others look through it than see it. Each of the others'
-        points is weighted by its share in the others, because they show the same walls many times.
+        Shape (k, 2), one row per keyframe in their order: number of points that beams of the opposite side pass
+        through, and number of points in its view. A point of ``own`` counts as passed through if beams of more of the
+        others pass through it than end at it. The points of ``others`` are weighted by the inverse of their number of
+        keyframes, because these show the same walls many times.
     """
     off = keyframes.poses[own, None, :2] - keyframes.poses[others, :2]
     far = np.hypot(off[..., 0], off[..., 1])

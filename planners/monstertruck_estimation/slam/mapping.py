@@ -205,7 +205,7 @@ class Mapper:
         """Match the scan from the predicted ``motion``, or from the first alternative prediction that fits.
 
         Returns:
-            Return the scan (without moving points if the predicted motion is right), the motion used, and its match.
+            The scan (without moving points if the predicted motion is right), the motion used, and its match.
         """
         match = self._matched(scan, *motion)
         still = self._still(scan, stamp, motion[0], match)

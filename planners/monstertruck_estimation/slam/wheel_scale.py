@@ -37,7 +37,7 @@ class WheelScale:
         self._by_wheels, self._by_scans = np.zeros(3), np.zeros(3)
 
     def add(self, by_wheels: Array, by_scans: Array) -> None:
-        """Add the motion between two scans by both, shape (3,); the scans' turn is used for both."""
+        """Add the motion between two scans by wheels and by scans, shape (3,) each; both use the turn by scans."""
         turned = np.array((*by_wheels[:2], by_scans[2]))
         self._by_wheels, self._by_scans = compose(self._by_wheels, turned), compose(self._by_scans, by_scans)
         driven, seen = self._by_wheels[:2], self._by_scans[:2]

@@ -91,10 +91,10 @@ class Inputs:
 class Behaviour(Protocol):
     """Behaviour constructed from its settings; the state returned by a step is all it keeps between steps.
 
-    A class with an attribute ``may_read``, more topics, gets their fresh messages, too.
+    A class may list more topics in an attribute ``may_read``; it then receives their fresh messages, too.
 
-    A class with a class method ``fit(settings, body)`` is constructed by it instead at every start, with a
-    ``BehaviourBody`` too; it raises a ``ValueError`` if the body cannot do that or the settings are wrong.
+    If a class has a class method ``fit(settings, body)``, this method constructs the behaviour at every start, with a
+    ``BehaviourBody``. It raises a ``ValueError`` if the body cannot execute the behaviour or the settings are wrong.
     """
 
     reads: ClassVar[tuple[Topic[Any], ...]]

@@ -1,1 +1,1 @@
-"""Exploration: where to look next in a map that grows; sends goals to the goal service and drives nothing itself."""
+"""Exploration: chooses the next viewpoint in a growing map and sends it as a goal to the goal service."""

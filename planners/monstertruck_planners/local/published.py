@@ -83,7 +83,7 @@ class PublishedPlanner:
         return LocalPlan(Reason.OK, replace(state, turning=()), path, state.final and ends_at(path, goal))
 
     def _pruned(self, band: PosePath | None, obstacles: DistanceField, robot_pose: Array) -> PosePath | None:
-        """Return the band from its furthest bubble that touches the truck's."""
+        """Return the band, starting at its furthest bubble that touches the truck's bubble."""
         if band is None:
             return None
         field, cover = obstacles.data(), self._band.cover

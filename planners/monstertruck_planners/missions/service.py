@@ -506,7 +506,7 @@ class MissionService:
         return await self._stand(lambda: (until - self._clock.now()) / SECOND)
 
     async def _stand(self, left: Callable[[], float | None]) -> StepEnd:
-        """Stand until no seconds are ``left``.
+        """Stand until ``left`` returns no remaining seconds.
 
         Raises:
             RequestRefusedError: the robot was disarmed.
