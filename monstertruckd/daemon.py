@@ -255,7 +255,7 @@ class Daemon:
     async def _recording(self) -> AsyncIterator[None]:
         """Recorder and black box; the log file is closed before a black box that is written at shutdown.
 
-        The black box stops first, as closing the log file takes real time: it holds nothing of that time.
+        The black box stops first, because closing the log file takes real time; it contains no messages of that time.
         """
         recorder, box = self.recorder, self.black_box
         async with AsyncExitStack() as after:

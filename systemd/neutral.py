@@ -199,7 +199,7 @@ def stop_steppers(port: str, words: str, baud: int) -> None:
 
 
 def stop_board(port: str, words: str, baud: int) -> None:
-    """Take the motors' voltage; a board that restarts because its port was opened is waited for.
+    """Cut the motors' voltage; wait for a board that restarts because its port was opened.
 
     Raises:
         OSError: the port cannot be used.
@@ -302,7 +302,7 @@ def receive(line: int, count: int) -> bytes:
 
 
 def some(line: int) -> bytes:
-    """Read what comes next."""
+    """Read the next bytes of an answer."""
     if not select.select([line], [], [], 0.25)[0]:
         raise NotStoppedError("no answer")
     data = os.read(line, 4096)

@@ -207,10 +207,10 @@ class Computer:
     watch: Callable[[], Watcher] = open_watcher
     """Creates the source of USB announcements."""
     disk: Callable[[Path], Disk] = disk_of
-    """Its file system at a path."""
+    """File system of the computer."""
 
     @classmethod
     def at(cls, root: Path, clock: Clock) -> Self:
-        """The real computer, or one emulated by another process in the folder ``root``, which announces nothing."""
+        """Return the real computer, or the one emulated by another process in ``root``, without announcements."""
         machine = Machine(clock, Sysfs(root / "sys"), root / "dev")
         return cls(machine, root, open_watcher if root == ROOT else NoWatcher)

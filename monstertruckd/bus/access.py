@@ -59,7 +59,7 @@ class Sender:
         return self.grant.role.covers(needed)
 
     def refusal(self, needed: AccessRole) -> str:
-        """Why its role does not include ``needed``."""
+        """Reason why the role of this source does not include ``needed``."""
         hint = "; the key contains no source" if self.source == ANONYMOUS else ""
         return f"{self.source} has the role {self.grant.role}, but this needs {needed}{hint}"
 

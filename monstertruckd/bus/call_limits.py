@@ -83,7 +83,7 @@ class CallLimits:
         return TOO_MANY if waiting >= allowance.waiting else ""
 
     def ended(self, name: str, source: str | None) -> None:
-        """A call that was taken has been carried out, or is discarded."""
+        """Note that an accepted call was carried out or discarded."""
         if name == ESTOP:
             with self._lock:
                 owner = owner_of(source or ANONYMOUS)

@@ -64,7 +64,7 @@ class Tap:
 
 @dataclass(slots=True)
 class _ReadEnds:
-    """Who gets the messages of one topic."""
+    """Readers and taps of one topic."""
 
     listeners: list[Callable[[Any], object]] = field(default_factory=list)
     mailboxes: tuple[Mailbox[Any], ...] = ()
@@ -200,7 +200,7 @@ class Bus:
         return self._drops + sum(mailbox.drops for ends in self._ends.values() for mailbox in ends.mailboxes)
 
     def add_drops(self, count: int) -> None:
-        """Count losses in a queue of someone else."""
+        """Count messages lost in a queue outside the bus."""
         self._drops += count
 
     def hand_over(self, topic: Topic[M], message: M) -> list[object]:

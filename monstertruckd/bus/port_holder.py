@@ -25,8 +25,8 @@ def holder_of(endpoints: Iterable[str], proc: Path = PROC) -> str:
     """Describe the programs that listen at one of ``endpoints``: robots by name, processes by number and command line.
 
     Returns:
-        For example ``robot 'truck', process 4711 (monstertruckd run --config demo.yaml)``; of a process that this user
-        may not look into ``a program of user 'ann'``, or ``another program``.
+        For example ``robot 'truck', process 4711 (monstertruckd run --config demo.yaml)``; for a process that this user
+        may not inspect, ``a program of user 'ann'`` or ``another program``.
     """
     places = list(endpoints)
     processes = [*_processes(places, proc)] or [*_owners(places, proc)]
@@ -34,7 +34,7 @@ def holder_of(endpoints: Iterable[str], proc: Path = PROC) -> str:
 
 
 def _robots(endpoints: list[str]) -> Iterator[str]:
-    """Robots that answer, and those that announce the port and answer only those who have a certificate."""
+    """Yield robots that answer, and robots that announce the port but answer only clients with a certificate."""
     names: dict[str, None] = {}
     for endpoint in endpoints:
         local = protocol_of(endpoint) == "tcp" and host_of(endpoint) in (*LOCAL_HOSTS, *EVERYWHERE)

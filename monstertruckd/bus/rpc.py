@@ -100,7 +100,7 @@ class Rpc:
         return reason is Reason.OK, answered
 
     async def _answer(self, sender: Sender, name: str, payload: bytes) -> tuple[Reason, bytes]:
-        """``OK`` and the answer, or why not and the error reply."""
+        """Return ``OK`` and the answer, or the reason of the failure and the error reply."""
         needed = self._needed.get(name, AccessRole.OBSERVER)
         if not sender.may(needed):
             return Reason.NOT_PERMITTED, failure(Reason.NOT_PERMITTED, f"{name}: {sender.refusal(needed)}")

@@ -298,7 +298,7 @@ class LogReader:
 
     @property
     def fault(self) -> str | None:
-        """All damage found by a complete iteration, as text to follow the log's name; None for an undamaged log."""
+        """All damage found by a complete iteration, as text that follows the log's name; None for an undamaged log."""
         return ", ".join([*self.flaws, *([] if self.damage is None else [self.damage])]) or None
 
     @property

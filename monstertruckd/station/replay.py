@@ -39,7 +39,7 @@ class RecordedLog(Iterable[Any], Protocol):
 
     @property
     def fault(self) -> str | None:
-        """Fault found by an iteration to the end, as text to follow the log's name; None for a sound log."""
+        """Fault found by an iteration to the end, as text that follows the log's name; None for a sound log."""
 
 
 LogOpener = Callable[[Path], RecordedLog]
@@ -175,7 +175,7 @@ class ReplayFeed:
         self._send_state()
 
     def holds(self, stamp: int) -> bool:
-        """Return whether the recording holds the moment of a stamp of the robot's clock (ns)."""
+        """Return whether the recording covers a stamp of the robot's clock (ns)."""
         return self._begin <= stamp <= self._end
 
     def show_moment(self, stamp: int) -> None:

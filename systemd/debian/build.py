@@ -2,9 +2,10 @@
 
     python3 systemd/debian/build.py [--output FOLDER]
 
-The package holds the program with all packages that the lock file pins for a robot (hashes checked), in an environment
-of its own in ``/opt/monstertruckd/VERSION``, for the Python of the computer that builds it: build on the Debian release
-that the robot runs. Needs ``dpkg-deb`` and the package index; not root. Uses nothing but Python's standard library.
+The package contains the program with all packages that the lock file pins for a robot (hashes checked), in a separate
+environment in ``/opt/monstertruckd/VERSION``. It works with the Python of the computer that builds it, so build it on
+the Debian release of the robot. The build needs ``dpkg-deb`` and the package index, but neither root nor packages beyond
+Python's standard library.
 """
 
 import argparse

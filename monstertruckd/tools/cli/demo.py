@@ -206,7 +206,7 @@ def _film(config: Path, film: Path, seconds: float, *, alone: bool) -> None:
     """Record one robot.
 
     Raises:
-        InputError: an option cannot be combined with it.
+        InputError: an option cannot be combined with ``--film``.
     """
     from monstertruckd.tools.demo.runs import run_film
     from monstertruckd.tools.simulation.config import load_simulated

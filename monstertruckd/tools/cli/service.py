@@ -81,7 +81,7 @@ def install_service(
 def uninstall_service(
     dry_run: DryOption = False, root: RootOption = Path("/"), json_output: JsonOption = False
 ) -> None:
-    """Stop the service and take it out; configuration, logs, state and the user stay."""
+    """Stop and remove the service; configuration, logs, state and the user stay."""
     from monstertruckd.tools.install.apply import uninstall
 
     report = _as_root(lambda: uninstall(root, dry=dry_run))

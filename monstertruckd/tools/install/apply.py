@@ -72,7 +72,7 @@ def run_command(arguments: Sequence[str]) -> str:
 
     Raises:
         NotFoundError: it does not exist.
-        CommandFailedError: it failed; the text is its own.
+        CommandFailedError: the program failed; the error contains its output.
     """
     try:
         done = subprocess.run(arguments, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL)  # noqa: S603

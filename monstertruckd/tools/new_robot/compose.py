@@ -32,7 +32,7 @@ def robot(answers: Answers, tree: TreeSnapshot, navigation: str) -> Section:
 
     Args:
         answers: description of the robot.
-        tree: USB devices of this computer, which name the ports of the kinds they can only be.
+        tree: USB devices of this computer; a device that can only be of one kind gives that kind its port.
         navigation: file name of the part with mapping, planner, tracker and explorer.
 
     Raises:

@@ -59,7 +59,7 @@ class ScaleWatch:
 
         Args:
             latest: the revolution to judge.
-            motions: see ``scale_change``, from the revolution before; always as many, by the wheels last.
+            motions: since the previous revolution, see ``scale_change``; always as many, the wheels' motion last.
         """
         earlier = self._reference
         factor = self._changed(latest, motions)

@@ -248,7 +248,7 @@ class PointService:
         ) <= self._config.tilt  # fmt: skip
 
     def _worth(self, pose: Pose2) -> bool:
-        """Whether the robot has moved since the last images, or has read only one here."""
+        """Whether the robot has moved since the last images, or has read only one image at this place."""
         # maximum motion (m, rad) of a robot still at the place of the last image
         standing = (0.02, 0.02)
         if self._looked is not None:

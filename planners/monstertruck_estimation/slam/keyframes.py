@@ -227,7 +227,7 @@ TURN_LEVER: Final = 0.7
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Join:
-    """Join of two submaps that may be wrong."""
+    """Provisional join of two submaps."""
 
     own: int
     """Number of the robot's submap, to which later keyframes belong."""

@@ -295,7 +295,7 @@ class WallLine:
         return state._replace(seen=float(on_wall[-1, 5])) if len(on_wall) else state
 
     def _opening(self, state: LineState, wall: WallEstimate, cone: Cone) -> bool:
-        """Whether the side sonar looks through an opening: the diagonal sonar may then hear the far post."""
+        """Whether the side sonar looks through an opening: the diagonal sonar may then detect the far post."""
         if not cone.hears(state.pose[2] + state.mounts[SIDE].yaw, wall.normal):
             return False
         fresh = _fresh(state.echoes[state.echoes[:, 4] == SIDE], state)
