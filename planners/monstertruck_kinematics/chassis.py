@@ -232,7 +232,7 @@ class Chassis(ABC):
         return front, self._rear(front)
 
     def limited_steering(self, angles: Angles, limit: float) -> tuple[Angles, bool]:
-        """Steering angles with axle angles within the limit as by ``limited``, and whether that changed them."""
+        """Return the steering angles with axle angles limited as in ``limited``, and whether this changed them."""
         if not self.steered or max(map(abs, angles)) <= limit:
             return angles, False
         return self.limited(angles[0], angles[1], limit), True

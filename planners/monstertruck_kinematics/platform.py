@@ -1,6 +1,6 @@
 """Descriptions of robots whose wheels are not steered: a platform on driven wheels, each on its own spring.
 
-A wheel with rollers (Swedish, mecanum) is made from its ideal: a ball that rolls freely about the axis of its rollers
+A wheel with rollers (Swedish, mecanum) is modelled by an ideal: a ball that rolls freely about the axis of its rollers
 and is driven about the level axis across it. Along the rollers' axis it has the tyre's friction, across it rolls. The
 ball touches the ground only; a wheel's outline around it touches walls.
 """

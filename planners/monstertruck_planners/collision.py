@@ -324,9 +324,9 @@ def _valid_beams(scan: LaserScan) -> NDArray[np.intp]:
 def scan_points_at(
     scan: LaserScan, mount: tuple[float, float, float], stamp: int, twist: tuple[float, float, float]
 ) -> Array:
-    """Valid returns of a scan in the base frame as it is some time after the beams.
+    """Return the valid returns of a scan in the base frame at a later time.
 
-    A scan is a tenth of a second old when it comes: at half a radian a second that is 10 cm on 2 m.
+    A scan is a tenth of a second old on arrival; at 0.5 rad/s this turns a point 2 m away by 10 cm.
 
     Args:
         scan: the revolution.

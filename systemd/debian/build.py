@@ -4,8 +4,8 @@
 
 The package contains the program with all packages that the lock file pins for a robot (hashes checked), in a separate
 environment in ``/opt/monstertruckd/VERSION``. It works with the Python of the computer that builds it, so build it on
-the Debian release of the robot. The build needs ``dpkg-deb`` and the package index, but neither root nor packages beyond
-Python's standard library.
+the Debian release of the robot. The build needs ``dpkg-deb`` and the package index, but no root; it uses only Python's
+standard library.
 """
 
 import argparse

@@ -286,7 +286,7 @@ class HubCoordinator:
                 self._report_returned(outage, back, now)
 
     def _stagger(self, starting: list[str], now: int) -> None:
-        """Schedule the devices of one hub; a device that loads it starts with a delay: hubs do not load each other."""
+        """Schedule the devices of one hub; a device that loads it starts with a delay. Hubs are independent."""
         turns = accumulate(name != starting[0] and self._loads(name) for name in starting)
         for turn, name in zip(turns, starting, strict=True):
             self._slots[name].free_at = now + turn * _ns(self._config.stagger)

@@ -35,7 +35,7 @@ class BatteryModel:
         self._filtered = self.volts
 
     def set_charge(self, charge: float) -> None:
-        """Replace the pack with one at another charge, 0..1."""
+        """Replace the pack by a pack with another charge (0..1)."""
         self.charge = charge
         self._rest = rest_voltage(charge, self._config.cells)
         self.volts = self._loaded(self._config.electronics_w / self._rest)

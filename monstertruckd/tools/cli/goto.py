@@ -1,6 +1,6 @@
-"""``goto``, ``track``, ``path``, ``explore``, ``dock``, ``undock``: drive the robot somewhere and follow its progress.
+"""``goto``, ``track``, ``path``, ``explore``, ``dock``, ``undock``: drive the robot and follow its progress.
 
-``convert-path``.
+Also ``convert-path``, which needs no robot.
 """
 
 from collections.abc import Iterator

@@ -84,7 +84,7 @@ def snap_command(
     count: Annotated[int, typer.Option(min=1, max=1000, help="Pictures.")] = 20,
     every: Annotated[float, typer.Option(min=0.0, max=60, help="Seconds between two images.")] = 2.0,
 ) -> None:
-    """Take pictures with a camera: of the board, held anyhow, or of the table with its marks."""
+    """Take pictures with a camera: of the board in any pose, or of the table with its marks."""
     from monstertruckd.tools.cli.stand_session import snap
 
     snap(_load(config), camera, folder, count, every)

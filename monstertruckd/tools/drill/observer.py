@@ -273,7 +273,7 @@ class _MaestroWire:
 
 
 class _SentPulses:
-    """Servo controller with a protocol unknown here: its pulses, read from the world.
+    """Servo controller whose protocol this module does not know; its pulses are read from the world.
 
     Args:
         tap: tap of its cable.
