@@ -1,8 +1,9 @@
 """Recorded logs whole and thinned: every 2nd, 5th, 10th and 20th scan, with the wheels between them.
 
 Up to a spacing of ``SPACING``, a thinned log must be as good as the whole one: no scan is ``lost`` where the whole log
-maps throughout, and the error is at most ``WORSE`` times as large. URG-04LX exp2 has no reference and no wheels: its
-thinned logs are compared with the whole one.
+maps throughout, and the error is at most ``WORSE`` times as large. The whole log's motion leads from the scans of a
+thinned log to references between them (``at_all_scans``). URG-04LX exp2 has no reference and no wheels: its thinned
+logs are compared with the whole one.
 """
 
 import math
@@ -16,7 +17,7 @@ from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.mapping import MappingEstimator
 from monstertruck_estimation.slam.scans import prepare_input
 from monstertruck_estimation.slam.worker_io import ScanInput
-from monstertruck_kinematics.se2 import between, interpolate
+from monstertruck_kinematics.se2 import between, compose, interpolate
 from monstertruck_schemas.health import LocalisationStatus
 from monstertruckd.tools.logs.scans import read_scans
 from slam_parts.logs import deviation, load, scored
@@ -45,13 +46,19 @@ def inputs(folder: Path, name: str) -> tuple[list[ScanInput], Callable[[Track], 
         for stamp, ranges, odom in zip(log.stamps, log.ranges, log.odom, strict=True)
     ]  # fmt: skip
     key = "at_scans" if log.by_relations else "median"
+    return scans, lambda track: scored(log, *track)[key]
 
-    def error(track: Track) -> float:
-        # Relations at scan times of the whole log lie between the scans of a thinned one.
-        score = scored(log, *track)
-        return score[key] if len(track[0]) > 0.9 * len(scans) else score["mean" if log.by_relations else "median"]
 
-    return scans, error
+def at_all_scans(dense: Track, track: Track) -> Track:
+    """Return poses at all scans of the whole log: those of the thinned ``track``, led on by the motion of ``dense``.
+
+    Interpolation would measure how the robot drove between the scans: for every 5th scan of Intel, poses of the whole
+    log are then off by 0.11 m, too.
+    """
+    (stamps, poses), (kept, placed) = dense, track
+    nearest = np.searchsorted((kept[1:] + kept[:-1]) / 2, stamps)
+    origins = interpolate(stamps.astype(float), poses, kept.astype(float))
+    return stamps, compose(placed[nearest], between(origins[nearest], poses))
 
 
 def mapped(scans: list[ScanInput]) -> tuple[Track, dict[str, float]]:
@@ -81,7 +88,7 @@ def run(folder: Path, names: Sequence[str]) -> tuple[dict[str, float], dict[str,
             if dense is None:
                 dense, clean = track, notes["lost"] == 0
             place, turn = _spacing(track[1])
-            notes["error"] = _from(dense, track) if error is None else error(track)
+            notes["error"] = _from(dense, track) if error is None else error(at_all_scans(dense, track))
             key = f"thinned.{name}.{every}"
             figures |= {f"{key}.{what}": round(value, 5) for what, value in notes.items()}
             figures |= {f"{key}.spacing_m": round(place, 3), f"{key}.spacing_rad": round(turn, 3)}
