@@ -9,6 +9,10 @@ import math
 from collections import deque
 from typing import Final
 
+import numpy as np
+
+from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
+
 NOISE_READINGS: Final = 20
 """Number of values over which the noise is measured."""
 
@@ -99,3 +103,12 @@ class WholeRepeats:
     def pause(self) -> None:
         """Start a new row: the next one does not follow the last, or has too little content to be compared."""
         self._last, self._row, self._moved, self.frozen = None, 1, 0.0, False
+
+
+def scan_content(scan: LaserScan) -> bytes | None:
+    """Return what a scan repeats if its lidar does, for ``WholeRepeats``; None if it has too few ranges.
+
+    It is the set of ranges: a lidar that repeats a packet, not a revolution, cuts its scans differently each time.
+    """
+    ranges, fewest = scan.ranges[scan.codes == VALID_BEAM], 20
+    return np.unique(ranges).tobytes() if len(ranges) >= fewest else None

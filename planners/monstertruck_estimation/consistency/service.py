@@ -10,6 +10,7 @@ from monstertruck_estimation.consistency.comparison import Measure
 from monstertruck_estimation.consistency.config import MAX_SPEED, ConsistencyConfig
 from monstertruck_estimation.consistency.exchange import StepInput, StepOutput
 from monstertruck_estimation.consistency.monitor import ConsistencyMonitor
+from monstertruck_estimation.consistency.repeats import scan_content
 from monstertruck_estimation.inertial import Inertial
 from monstertruck_estimation.scan_tilt import ScanAngles, plane_slopes
 from monstertruck_estimation.slam.worker_io import ScanInput
@@ -25,7 +26,6 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import DeviceRole, ServiceName
 from monstertruck_schemas.sensor import (
-    VALID_BEAM,
     Attitude,
     Battery,
     CompressedImage,
@@ -201,7 +201,7 @@ class ConsistencyService:
         for battery in () if inputs.battery is None else inputs.battery.drain():
             monitor.observe_value(DeviceRole.BATTERY, "voltage", battery.stamp, battery.raw_voltage)
         for scan in () if inputs.scan_2 is None else inputs.scan_2.drain():
-            monitor.observe_whole(DeviceRole.LIDAR_2, scan.stamp, _whole(scan))
+            monitor.observe_whole(DeviceRole.LIDAR_2, scan.stamp, scan_content(scan))
         for image in () if inputs.camera is None else inputs.camera.drain():
             monitor.observe_whole(DeviceRole.CAMERA, image.stamp, image.data)
 
@@ -224,7 +224,7 @@ class ConsistencyService:
         async with setup.actor as actor:
             await actor.start()
             async for scan in scans:
-                self.monitor.observe_whole(DeviceRole.LIDAR, scan.stamp, _whole(scan))
+                self.monitor.observe_whole(DeviceRole.LIDAR, scan.stamp, scan_content(scan))
                 work = self._work(setup, scan)
                 if work is None:
                     self.monitor.observe_scan(StepOutput(scan.stamp, None))
@@ -295,9 +295,3 @@ class ConsistencyService:
                 standing=standing,
             )
         )
-
-
-def _whole(scan: LaserScan) -> bytes | None:
-    """Return the ranges of a scan, to be compared with the previous one; None if it has too few."""
-    fewest_beams = 20
-    return scan.ranges.tobytes() if int((scan.codes == VALID_BEAM).sum()) >= fewest_beams else None

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from monstertruck_estimation.consistency.repeats import RepeatDetector, WholeRepeats
+from monstertruck_estimation.consistency.repeats import RepeatDetector, WholeRepeats, scan_content
+from tests.unit.gate.rig import scan
 
 LEAST_ROW = 40
 
@@ -68,3 +69,26 @@ def test_without_noise_a_repeated_scan_is_accused_only_once_the_robot_moves():
     for _ in range(6):
         scans.observe(b"same", moved=0.03)
     assert scans.frozen
+
+
+def lidar_scan(ranges):
+    ranges = np.asarray(ranges, dtype=float)
+    return scan(0).model_copy(update={"ranges": ranges, "codes": np.full(len(ranges), 255, np.uint8)})
+
+
+def test_a_lidar_that_repeats_one_packet_is_accused_however_its_revolutions_are_cut():
+    rng, scans = np.random.default_rng(8), WholeRepeats()
+    for _ in range(20):
+        scans.observe(scan_content(lidar_scan(shown(rng.normal(2.0, 0.01, 450), 0.001))), moved=0.0)
+    assert not scans.frozen
+    packet = shown(rng.normal(2.0, 0.01, 12), 0.001)
+    for cut, beams in ((0, 450), (6, 449), (3, 451), (9, 450)):
+        scans.observe(scan_content(lidar_scan(np.resize(np.roll(packet, cut), beams))), moved=0.0)
+    assert scans.frozen
+
+
+def test_the_content_of_a_scan_is_in_its_valid_ranges():
+    some = lidar_scan(np.linspace(1.0, 2.0, 30))
+    assert scan_content(some) == scan_content(lidar_scan(np.linspace(1.0, 2.0, 30)[::-1]))
+    codes = np.array([0] * 11 + [255] * 19, np.uint8)
+    assert scan_content(some.model_copy(update={"codes": codes})) is None
