@@ -294,6 +294,25 @@ def test_the_operator_of_a_robot_without_range_sensors_looks_where_it_drives(pla
     run_virtual(main)
 
 
+@pytest.mark.parametrize(("name", "sees_ahead", "sees_behind"), [("sonar", True, False), ("skid_stand", False, False)])
+def test_the_operator_looks_where_the_robot_has_no_range_sensor(name: str, sees_ahead: bool, sees_behind: bool) -> None:
+    config = load_config(CONFIGS / "robots" / f"{name}.yaml", SimulatedTruckConfig)[0]
+
+    async def main(clock: VirtualClock) -> None:
+        wander = np.random.default_rng(1)
+        async with DrillTruck.running(wired(config), clock, wander=wander, judged=True) as truck:
+            world, now, station = truck.rig.world, clock.now(), truck.station
+            assert isinstance(station, Wanderer)
+            truth, away = world.truth(now), config.sim.world.truck.length / 2 + 0.2
+            for side in (1, -1):
+                x, y = truth.x + side * away * math.cos(truth.yaw), truth.y + side * away * math.sin(truth.yaw)
+                world.add(now, Disc(x, y, 0.1))
+            assert station._clear((0.2, 0.0, 0.0)) is sees_ahead
+            assert station._clear((-0.2, 0.0, 0.0)) is sees_behind
+
+    run_virtual(main)
+
+
 def test_a_wanderer_that_is_refused_unseen_ground_holds_the_second_control_after_a_while() -> None:
     async def main(clock: VirtualClock) -> None:
         config = with_overlay(wired(demo()), {"tracker": None, "path": None})

@@ -37,9 +37,6 @@ from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 OPTIONAL: Final = frozenset({"recorder"})
 """Services that a fault may end for the rest of a run, because driving continues without them."""
 
-RANGE_SENSORS: Final = frozenset({DeviceRole.LIDAR, DeviceRole.SONAR})
-"""Roles of range sensors."""
-
 DaemonReport = Event | GateState | HealthTable
 
 
@@ -296,10 +293,14 @@ class DrillTruck:
             self.station = DrivingStation(rig.bus, rig.clock, 0.8 * rig.config.gate.speed, angle)
 
     def _looks(self) -> Callable[[Twist2], bool]:
-        """Return whether a motion stays clear for the operator; a robot with range sensors must see for itself."""
-        if RANGE_SENSORS & self.rig.config.devices.present().keys():
+        """Return whether a motion stays clear for the operator, who looks where the robot has no range sensor.
+
+        A robot with a lidar stops by itself before ground that it has not seen, one with sonars only ahead.
+        """
+        present, clear = self.rig.config.devices.present(), partial(stays_clear, self.rig.world)
+        if DeviceRole.LIDAR in present:
             return lambda _: True
-        return partial(stays_clear, self.rig.world)
+        return (lambda twist: twist[0] > 0 or clear(twist)) if DeviceRole.SONAR in present else clear
 
     @property
     def observer(self) -> Observer:
