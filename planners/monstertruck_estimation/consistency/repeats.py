@@ -108,7 +108,11 @@ class WholeRepeats:
 def scan_content(scan: LaserScan) -> bytes | None:
     """Return what a scan repeats if its lidar does, for ``WholeRepeats``; None if it has too few ranges.
 
-    It is the set of ranges: a lidar that repeats a packet, not a revolution, cuts its scans differently each time.
+    Hardly any scan has fewer different ranges than it needs at all. A lidar with one that has repeats a packet, cut
+    differently in each revolution: its content is the set of its ranges.
     """
     ranges, fewest = scan.ranges[scan.codes == VALID_BEAM], 20
-    return np.unique(ranges).tobytes() if len(ranges) >= fewest else None
+    if len(ranges) < fewest:
+        return None
+    different = np.unique(ranges)
+    return (different if len(different) < fewest else scan.ranges).tobytes()
