@@ -80,6 +80,11 @@ UNREVEALED: Final = (
         "`steering_dead` where the truck turns otherwise than ordered",
     ),
     Unrevealed(
+        ("lidar* range offset",),
+        "a constant error of all ranges hardly changes their motion, except in small rooms",
+        "the robot stops before obstacles nearer or further by the error; beyond `gate.obstacle.ahead` it touches them",
+    ),
+    Unrevealed(
         ("lidar adjust *", "lidar stream *"),
         "commanded only at the start of a session",
         "`scan_stale`: without scans the robot stops",
