@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Pose2, placed, points_placed, points_relative
-from monstertruck_planners.collision import DistanceField, Footprint, rectangle_distance
+from monstertruck_planners.collision import DistanceField, Footprint, beyond, rectangle_distance
 from monstertruck_planners.goals.exchange import SeenGround
 from monstertruck_planners.pose_path import PosePath
 
@@ -70,7 +70,9 @@ class Unseen:
             gaps = rectangle_distance(self.footprint, pose[None], places)[0]
             # Mean speed along a route (m/s), used to estimate its time of arrival at a place.
             unseen = left < SOON + along / 0.1
-            if direction < 0 and (unseen & (gaps < BESIDE)).any():
+            along_body, beside_body = beyond(self.footprint, pose[None], places[unseen])
+            covered = (along_body < BESIDE) & (beside_body < -self.footprint.padding)
+            if direction < 0 and covered.any():
                 # 0.6: unseen ground within this distance (m) of the reverse motion is closed to the next route: one
                 # truck length, since a route next to it would not be better
                 return np.asarray(places[unseen & (gaps < 0.6)])

@@ -137,10 +137,14 @@ def test_a_path_backs_onto_unseen_ground_beyond_where_it_began(legs, met):
     assert bool(len(backed_onto(path(*legs), survey()))) is met
 
 
-@pytest.mark.parametrize(("beyond", "met"), [(0.8, True), (1.2, False)])
-def test_a_reverse_motion_ends_where_the_gate_would_stop_before_unseen_ground(beyond, met):
+@pytest.mark.parametrize(
+    ("behind", "beside", "met"), [(0.8, 0.0, True), (1.2, 0.0, False), (-1.0, 0.8, False), (-1.0, -1.0, True)]
+)
+def test_a_reverse_motion_ends_where_the_gate_would_stop_before_unseen_ground(behind, beside, met):
+    """The gate looks along the motion: ground beside the body does not stop it."""
     assert BESIDE == DRIFT
-    places = np.array([(HERE[0] - 0.2 - BACK - beyond * DRIFT, HERE[1])])
+    side = 0.0 if behind > 0 else FOOTPRINT.half_width
+    places = np.array([(HERE[0] - 0.2 - BACK - behind * DRIFT, HERE[1] + side + beside * DRIFT)])
     unseen = Unseen(places, np.zeros(1), LIDAR, FIELD, 4.0, FOOTPRINT)
     free = DistanceField(np.zeros((60, 100), np.bool_), 0.05)
     assert bool(len(unseen.met(path((0.2, -1.0)), free))) is met
