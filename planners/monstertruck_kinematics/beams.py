@@ -9,16 +9,18 @@ from monstertruck_kinematics.elementary import Array
 
 
 def nearest_beams(bearings: NDArray[np.floating], start: float | Array, step: float | Array) -> NDArray[np.intp]:
-    """Number of the beam nearest to each bearing; not less than the number of beams where none looks there.
+    """Return the number of the beam nearest to each bearing.
+
+    Where no beam points in this direction, the result is at least the number of beams.
 
     Args:
         bearings: shape (n,) or (m, n), rad.
-        start: bearing of the first beam, or of m scans' first beams (m, 1), rad.
-        step: angle from each beam to the next, negative clockwise, rad; as ``start``. 0: there is a single beam, the
-            nearest one to all bearings.
+        start: bearing of the first beam, or of the first beams of m scans (m, 1), rad.
+        step: angle from each beam to the next, negative clockwise, rad; shape as ``start``. 0: there is a single beam,
+            which is the nearest one to all bearings.
 
     Returns:
-        As ``bearings``, never negative.
+        Shape as ``bearings``, never negative.
     """
     sense = np.where(np.less(step, 0.0), -1.0, 1.0)
     width = np.where(np.equal(step, 0.0), math.tau, np.abs(step))
@@ -27,5 +29,5 @@ def nearest_beams(bearings: NDArray[np.floating], start: float | Array, step: fl
 
 
 def is_full_turn(count: int, step: float) -> bool:
-    """Whether the last of ``count`` beams, ``step`` rad apart, is the first one's neighbour."""
+    """Whether the last of ``count`` beams, ``step`` rad apart, is a neighbour of the first."""
     return count > 1 and (count + 0.5) * abs(step) > math.tau

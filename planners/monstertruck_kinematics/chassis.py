@@ -9,11 +9,11 @@ A motion is requested in one of three forms, and ``forms`` lists the accepted on
 - ``shafts``: the speed of every driven shaft, open loop, while the steering stays as it is. ``predicted`` is the twist
   that follows from it.
 
-The first two lead to the angles that the body's wheels are steered to and to a twist of its base. At given steering
-angles a chassis computes which part of a twist is possible (``along``) and which shaft speeds make it; from measured
-shaft speeds and servo angles it finds the twist again. Bodies that steer nothing can pass from any motion to any other.
+The first two forms determine the steering angles of the wheels and a twist of the base. For given steering angles, a
+chassis computes the possible part of a twist (``along``) and the shaft speeds for it and, conversely, the twist from
+measured shaft speeds and servo angles. Bodies without steering can change from any motion to any other.
 
-The bicycle of a body without axles is virtual, its wheelbase being the body's reference length. ``freedom``:
+The bicycle of a body without axles is virtual; its wheelbase is the reference length of the body. ``freedom``:
 
 - ``both``: any pair of angles (truck, independent, omni, mecanum).
 - ``front``: the rear angle is 0. A car's base lies between its axles; a differential or skid-steer drive is the
@@ -65,7 +65,7 @@ AXLES: Final = ("front", "rear")
 """Names of the two axles."""
 
 STANDING: Final = 0.1
-"""A forward speed below this share of the whole motion is none."""
+"""Share of the whole motion below which a forward speed counts as 0."""
 
 
 WHEEL_REACH: Final = math.radians(100.0)
@@ -74,7 +74,7 @@ turn about when its motion passes through sideways, rad."""
 
 
 DIRECT: Final = SteeringPolynomials(AxlePolynomials((1.0, 0.0), (1.0, 0.0)), AxlePolynomials((1.0, 0.0), (1.0, 0.0)))
-"""A servo that turns its wheel itself."""
+"""Servo that turns its wheel directly."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Chassis(ABC):
     linkage: Axles | None
 
     forms: ClassVar[frozenset[Form]] = frozenset({"axles", "twist", "shafts"})
-    """Forms of request that it takes."""
+    """Accepted forms of requests."""
     straight: ClassVar[Angles] = (0.0, 0.0)
     """Steering angles for driving straight ahead; constant for a body that steers nothing."""
 
@@ -106,7 +106,7 @@ class Chassis(ABC):
 
     @abstractmethod
     def input_speeds(self, shaft_speeds: Speeds, *angles: float) -> Speeds:
-        """Speeds of the drive family's own inputs, m/s, from the shaft speeds; they hold while the steering changes."""
+        """Speeds of the drive family's own inputs, m/s, from the shaft speeds; valid while the steering changes."""
 
     @abstractmethod
     def twist(self, inputs: Speeds, *angles: float) -> Twist2:
@@ -122,7 +122,7 @@ class Chassis(ABC):
 
     @property
     def steering_errors(self) -> tuple[Angles, ...]:
-        """Unit errors of the steering angles that are independent of each other: coupled axles err together."""
+        """Independent unit errors of the steering angles; coupled axles have a common error."""
         if not self.steered:
             return ()
         return {"both": ((1.0, 0.0), (0.0, 1.0)), "front": ((1.0, 0.0),), "parallel": ((1.0, 1.0),)}[self.freedom]
@@ -135,12 +135,12 @@ class Chassis(ABC):
         return self.linkage is not None
 
     def possible(self, twist: Twist2) -> Twist2:
-        """The twist, with the sideways speed that follows from turning where the body cannot choose it.
+        """Return the twist, with the sideways speed that the turn causes if the body cannot choose it.
 
-        A ``vy`` of 0 is understood as none requested: a car whose base is not on its rear axle has one as it turns.
+        A ``vy`` of 0 means no request: a car whose base is not on its rear axle moves sideways as it turns.
 
         Raises:
-            KinematicsError: the body cannot move like that, nor nearly; the text gives the reason.
+            KinematicsError: the body cannot execute this motion or one close to it; the text gives the reason.
         """
         vx, vy, wz = twist
         if self.freedom == "parallel":
@@ -173,14 +173,14 @@ class Chassis(ABC):
         return self.bicycle.body_twist(signed_hypot(twist[0], twist[1]), *angles)
 
     def shafts_along(self, twist: Twist2, *angles: float) -> Speeds:
-        """Speed of every shaft for a twist that the body can do at steering angles."""
+        """Return the speed of every shaft for a twist that is possible at the steering angles."""
         return self.shaft_speeds(signed_hypot(twist[0], twist[1]), *angles)
 
     def predicted(self, shaft_speeds: Speeds, *angles: float) -> Twist2:
-        """Twist of the base that shaft speeds make at steering angles.
+        """Return the twist of the base for shaft speeds and steering angles.
 
         Raises:
-            KinematicsError: another number of shafts; or the shafts push against each other, so that the body's motion
+            KinematicsError: wrong number of shafts, or the shafts work against each other, so that the body's motion
                 is undetermined.
         """
         if len(shaft_speeds) != len(self.shafts):
@@ -202,7 +202,7 @@ class Chassis(ABC):
         return True
 
     def axle_angles(self, twist: Twist2, angles: Angles) -> tuple[float, float]:
-        """Axle angles of the bicycle that moves like this; 0 where none does."""
+        """Axle angles of the bicycle with this motion; 0 if no angles give it."""
         if self.steered and len(angles) == len(AXLES):
             return angles[0], angles[1]
         if abs(twist[0]) <= STANDING * max(map(abs, twist)):
@@ -225,7 +225,7 @@ class Chassis(ABC):
         return None
 
     def limited(self, front: float, rear: float, limit: float) -> tuple[float, float]:
-        """Axle angles within the limit that keep the curvature as far as possible, of angles the body can take."""
+        """Return axle angles within the limit that the body can take and that keep the curvature as far as possible."""
         if self.freedom == "both":
             return self.bicycle.limit_keeping_curvature(front, rear, limit)
         front = clip(front, -limit, limit)
@@ -298,7 +298,7 @@ def _require_way(vx: float, vy: float, wz: float, bicycle: FourWheelSteering) ->
 
 @lru_cache(maxsize=8)
 def _drive_secants(bicycle: FourWheelSteering, front: float, rear: float) -> tuple[float, float]:
-    """Kept, for the gate asks several times in every tick for the speeds at the same angles."""
+    """Return ``drive_secants``, cached because the gate needs the same angles several times in every tick."""
     return bicycle.drive_secants(front, rear)
 
 
@@ -310,12 +310,12 @@ class TruckChassis(Chassis):
     """
 
     def shaft_speeds(self, speed: float, front: float, rear: float) -> Speeds:
-        """Speed at the motor for the base's speed."""
+        """Motor speed for the base's speed."""
         travel, wheels = _drive_secants(self.bicycle, front, rear)
         return (speed / travel * wheels,)
 
     def input_speeds(self, shaft_speeds: Speeds, *angles: float) -> Speeds:
-        """The base's speed along its direction of travel."""
+        """Speed of the base along its direction of travel."""
         return (shaft_speeds[0] / self.bicycle.drive_speed(1.0, *angles),)
 
     def twist(self, inputs: Speeds, *angles: float) -> Twist2:
@@ -342,20 +342,20 @@ class FamilyChassis(Chassis):
         object.__setattr__(self, "_steered", len(self.family.inputs) > len(self.shafts))
 
     def shaft_speeds(self, speed: float, front: float, rear: float) -> Speeds:
-        """The family's inverse."""
+        """Shaft speeds by the family's inverse."""
         return self.shafts_along(self.bicycle.body_twist(speed, front, rear))
 
     def shafts_along(self, twist: Twist2, *angles: float) -> Speeds:
-        """The family's inverse."""
+        """Shaft speeds by the family's inverse."""
         command = self.family.inverse(twist_at(*twist, self.origin, 0.0))
         return tuple(value / self.per_speed for value in command[: len(self.shafts)])
 
     def input_speeds(self, shaft_speeds: Speeds, *angles: float) -> Speeds:
-        """The shafts themselves."""
+        """Return the shaft speeds unchanged."""
         return shaft_speeds
 
     def twist(self, inputs: Speeds, *angles: float) -> Twist2:
-        """The family's forward."""
+        """Twist by the family's forward kinematics."""
         driven = tuple(value * self.per_speed for value in inputs)
         twist = self.family.forward((*driven, angles[0]) if self._steered else driven)
         return twist_at(*twist, -self.origin, 0.0)
@@ -363,7 +363,7 @@ class FamilyChassis(Chassis):
 
 @dataclass(frozen=True)
 class TricycleChassis(FamilyChassis):
-    """One steered wheel in front, two that roll along on the rear axle, whose encoders measure the motion.
+    """One steered front wheel, and two passive rear wheels whose encoders measure the motion.
 
     Args:
         family: the drive.
@@ -397,11 +397,11 @@ class SynchroChassis(Chassis):
     family: Synchro
 
     def shaft_speeds(self, speed: float, front: float, rear: float) -> Speeds:
-        """All wheels roll as fast as the base."""
+        """Equal speeds: all wheels roll as fast as the base."""
         return (self.family.inverse((speed, 0.0, 0.0))[0] * self.family.wheel_radius,)
 
     def input_speeds(self, shaft_speeds: Speeds, *angles: float) -> Speeds:
-        """The shaft itself."""
+        """Return the speed of the only shaft."""
         return shaft_speeds
 
     def twist(self, inputs: Speeds, *angles: float) -> Twist2:
@@ -411,9 +411,9 @@ class SynchroChassis(Chassis):
 
 @dataclass(frozen=True)
 class SkidWheelsChassis(FamilyChassis):
-    """Left and right wheels, every wheel with a motor: front left, front right, rear left, rear right.
+    """Left and right wheels, each with its own motor: front left, front right, rear left, rear right.
 
-    Wheels of one side that turn unlike each other drag it along at their mean.
+    If the wheels of one side turn at different speeds, the side moves at their mean.
     """
 
     def shafts_along(self, twist: Twist2, *angles: float) -> Speeds:
@@ -430,7 +430,7 @@ class SkidWheelsChassis(FamilyChassis):
 class IndependentChassis(Chassis):
     """Two steered axles with ideal linkages, every wheel with its own motor.
 
-    Two axle angles always leave a forward speed: turning on the spot takes ``WheelSteerChassis``.
+    Two axle angles always require a forward speed; only ``WheelSteerChassis`` can turn on the spot.
 
     Args:
         family: the drive.
@@ -444,7 +444,7 @@ class IndependentChassis(Chassis):
         return self.family.inverse(twist)[len(self.shafts) :]
 
     def input_speeds(self, shaft_speeds: Speeds, *angles: float) -> Speeds:
-        """The shafts themselves."""
+        """Return the shaft speeds unchanged."""
         return shaft_speeds
 
     def twist(self, inputs: Speeds, *angles: float) -> Twist2:
@@ -454,7 +454,7 @@ class IndependentChassis(Chassis):
 
 @dataclass(frozen=True)
 class WheelSteerChassis(Chassis):
-    """Every wheel steered by a servo and driven by its own motor: any twist.
+    """A servo and a motor for every wheel: any twist.
 
     Args:
         family: the drive.
@@ -466,24 +466,24 @@ class WheelSteerChassis(Chassis):
 
     @property
     def steered(self) -> bool:
-        """All wheels are."""
+        """True, because every wheel has a servo."""
         return True
 
     @property
     def steering_errors(self) -> tuple[Angles, ...]:
-        """Every wheel has its own."""
+        """One independent error for every wheel."""
         return tuple(tuple(float(i == k) for k in range(len(self.shafts))) for i in range(len(self.shafts)))
 
     def servos(self, *angles: float) -> Angles:
-        """Each servo turns its wheel itself."""
+        """Servo angles equal the wheel angles."""
         return angles
 
     def steering(self, *servos: float) -> Angles:
-        """Each servo turns its wheel itself."""
+        """Wheel angles equal the servo angles."""
         return tuple(clip(servo, -WHEEL_REACH, WHEEL_REACH) for servo in servos)
 
     def steering_for(self, twist: Twist2, near: Angles) -> Angles:
-        """Wheels along their own velocities; a wheel rolls backwards rather than turn further than it must."""
+        """Point the wheels along their velocities; a wheel rolls backwards if that needs a smaller turn."""
         if twist == STILL:
             return near
         return tuple(
@@ -492,26 +492,26 @@ class WheelSteerChassis(Chassis):
         )
 
     def _nearest(self, angle: float, near: float, *, still: bool) -> float:
-        """The angle, or the same turned by half a turn, within reach and nearest to ``near``."""
+        """Return the angle or its opposite direction, whichever is within reach and nearest to ``near``."""
         if still:
             return near
         turned = [a for a in (angle, angle - math.pi, angle + math.pi) if abs(a) <= WHEEL_REACH]
         return min(turned, key=lambda a: abs(a - near))
 
     def steering_for_axles(self, front: float, rear: float, near: Angles) -> Angles:
-        """Wheels through the bicycle's ICR."""
+        """Point the wheels perpendicular to the lines to the bicycle's ICR."""
         return self.steering_for(self.bicycle.body_twist(1.0, front, rear), near)
 
     def limited_steering(self, angles: Angles, limit: float) -> tuple[Angles, bool]:
-        """Wheels have no axle angle."""
+        """Return the angles unchanged: wheels with their own servos have no axle angle."""
         return angles, False
 
     def along(self, twist: Twist2, *angles: float) -> Twist2:
-        """Least-squares twist of what each wheel can roll of its velocity."""
+        """Least-squares twist of the part of each wheel's velocity along the wheel."""
         return self.twist(self.shafts_along(twist, *angles), *angles)
 
     def aligned(self, angles: Angles, target: Angles) -> bool:
-        """Wheels far from where they must stand scrub, and would drive the body elsewhere."""
+        """Whether all wheels are close to their targets: other wheels would scrub and push the body off its motion."""
         # 0.35: wheels that are steered one by one may roll while they turn to angles this close, rad
         return max(abs(to - at) for at, to in zip(angles, target, strict=True)) <= 0.35
 
@@ -520,13 +520,13 @@ class WheelSteerChassis(Chassis):
         return self._wheels(self.bicycle.body_twist(speed, front, rear))[1]
 
     def shafts_along(self, twist: Twist2, *angles: float) -> Speeds:
-        """The part of every wheel's velocity along the wheel."""
+        """Component of every wheel's velocity along the wheel."""
         return tuple(
             speed * math.cos(angle - at) for angle, speed, at in zip(*self._wheels(twist), angles, strict=True)
         )
 
     def input_speeds(self, shaft_speeds: Speeds, *angles: float) -> Speeds:
-        """The shafts themselves."""
+        """Return the shaft speeds unchanged."""
         return shaft_speeds
 
     def twist(self, inputs: Speeds, *angles: float) -> Twist2:
@@ -549,22 +549,22 @@ class Dimensions:
     drivetrain: DriveTrain
     """Motor to wheel, the same for every shaft."""
     wheelbase: float = 0.32
-    """Between the axles, m; of a body without them, the length of its equivalent bicycle."""
+    """Distance between the axles, m; for a body without axles, the length of its equivalent bicycle."""
     track: float = 0.26
-    """Between left and right wheels, m."""
+    """Distance between left and right wheels, m."""
     polynomials: PolynomialSet | SteeringPolynomials = "corrected"
     """Linkage of the truck's axles."""
     servo_ranges: tuple[Range, Range] = (FULL, FULL)
-    """Servo angles, front and rear, that the servo controller's pulses reach, rad."""
+    """Front and rear servo angles that the servo controller's pulses can reach, rad."""
 
     @property
     def centred(self) -> FourWheelSteering:
-        """The bicycle whose base point lies in the middle between its axles."""
+        """Equivalent bicycle with its base point midway between the axles."""
         return FourWheelSteering(self.wheelbase, self.track)
 
     @property
     def linkage(self) -> SteeringPolynomials:
-        """Servo to wheels."""
+        """Linkage from servos to wheels."""
         known = self.polynomials
         return known if isinstance(known, SteeringPolynomials) else SteeringPolynomials.named(known)
 
@@ -574,10 +574,10 @@ class Dimensions:
 
 
 def truck_chassis(size: Dimensions, turn_deficit: Mapping[str, float] | None = None) -> Chassis:
-    """Two steered axles, one motor for all four wheels.
+    """Truck: two steered axles, one motor for all four wheels.
 
     Args:
-        size: the robot's.
+        size: dimensions of the robot.
         turn_deficit: fields of ``TurnDeficit``.
     """
     deficit = TurnDeficit(**turn_deficit) if turn_deficit and any(turn_deficit.values()) else None
@@ -586,10 +586,10 @@ def truck_chassis(size: Dimensions, turn_deficit: Mapping[str, float] | None = N
 
 
 def independent_chassis(size: Dimensions, steering: Literal["axles", "wheels"] = "axles") -> Chassis:
-    """A motor in every wheel.
+    """Body with a motor in every wheel.
 
     Args:
-        size: the robot's.
+        size: dimensions of the robot.
         steering: two steered axles with ideal linkages, or a servo for every wheel.
     """
     wheels = IndependentSteer(size.centred.wheel_positions, size.drivetrain.wheel_radius)
@@ -599,32 +599,32 @@ def independent_chassis(size: Dimensions, steering: Literal["axles", "wheels"] =
 
 
 def synchro_chassis(size: Dimensions) -> Chassis:
-    """Wheels that roll and turn together."""
+    """Synchro drive, whose wheels roll and turn together."""
     family = Synchro(size.drivetrain.wheel_radius)
     return SynchroChassis(size.centred, size.drivetrain, ("roll",), "parallel", size.ideal(DIRECT), family)
 
 
 def ackermann_chassis(size: Dimensions) -> Chassis:
-    """A car."""
+    """Car with Ackermann steering."""
     axles = LinkedAxles(size.centred, size.linkage.front, None, ranges=size.servo_ranges)
     return _steered_front(size, axles, Ackermann(size.wheelbase, size.track, size.drivetrain.wheel_radius))
 
 
 def bicycle_chassis(size: Dimensions, driven: Literal["front", "rear"] = "rear") -> Chassis:
-    """One steered front wheel, one fixed rear wheel.
+    """Bicycle: one steered front wheel, one fixed rear wheel.
 
     Args:
-        size: the robot's.
+        size: dimensions of the robot.
         driven: wheel that the motor drives.
     """
     return _steered_front(size, size.ideal(DIRECT), Bicycle(size.wheelbase, driven, size.drivetrain.wheel_radius))
 
 
 def tricycle_chassis(size: Dimensions, driven: Literal["front", "rear"] = "front") -> Chassis:
-    """One steered front wheel, two fixed rear wheels.
+    """Tricycle: one steered front wheel, two fixed rear wheels.
 
     Args:
-        size: the robot's.
+        size: dimensions of the robot.
         driven: axle that the motor drives.
     """
     family = Tricycle(size.wheelbase, driven, size.drivetrain.wheel_radius, track=size.track)

@@ -1,8 +1,8 @@
-"""The protocol of all drive families, and the checks they share.
+"""Protocol of all drive families, and their common checks.
 
-A command is the drive's inputs in order (speeds m/s, wheel rates rad/s, angles rad), a twist is (vx, vy, wz) of the
-drive's reference point in the body frame. Both are tuples of floats, or of (N,) arrays for N states at once; an
-(m, N) array serves as well.
+A command consists of the drive's inputs in order (speeds m/s, wheel rates rad/s, angles rad). A twist is (vx, vy, wz)
+of the drive's reference point in the body frame. Both are tuples of floats, or of (N,) arrays for N states at once; an
+(m, N) array works as well.
 """
 
 from collections.abc import Sequence
@@ -49,10 +49,10 @@ def refuse(name: str, value: Real, scale: Real, why: str) -> None:
 
 
 def unpacked(values: Sequence[Real], names: tuple[str, ...]) -> tuple[Real, ...]:
-    """The values, finite and of the right number.
+    """Return the values; refuse non-finite values and a wrong number of values.
 
     Raises:
-        KinematicsError: naming the entry.
+        KinematicsError: the message names the entry.
     """
     if len(values) != len(names):
         raise KinematicsError(f"got {len(values)} values: expected {len(names)} ({', '.join(names)})")

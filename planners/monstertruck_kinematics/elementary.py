@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 """Floats, of the shape that is stated where it is used."""
 Real = TypeVar("Real", float, Array)
-"""A float, or an array of any shape; every argument of one call is of one kind or broadcasts."""
+"""Float or array of any shape; all arguments of one call are of the same kind or broadcast."""
 
 
 class KinematicsError(ValueError):
-    """An argument, wheel or parameter that no robot can have; the text names it, its value and the expectation."""
+    """Impossible argument, wheel or parameter; the text gives its name, its value and the expected value."""
 
 
 def sin(x: Real) -> Real:
@@ -152,12 +152,12 @@ def polynomial(coefficients: tuple[float, ...], x: Real) -> Real:
 
 
 def interpolated(x: float, xs: Sequence[float], ys: Sequence[float]) -> float:
-    """Straight lines between points (as ``np.interp`` for one value, without its cost).
+    """Interpolate linearly between points (as ``np.interp`` for one value, at lower cost).
 
     Args:
-        x: where; beyond the ends the end's value is taken.
-        xs: not decreasing.
-        ys: as many.
+        x: position; beyond the ends the value at the end is used.
+        xs: positions of the points, not decreasing.
+        ys: values of the points.
     """
     i = bisect.bisect_right(xs, x)
     if i == 0 or i == len(xs):

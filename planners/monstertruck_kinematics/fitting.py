@@ -46,15 +46,15 @@ def least_squares(
     """Minimise the (Huber-weighted) squares of ``residual`` within bounds: Levenberg-Marquardt with an active set.
 
     Args:
-        residual: from the (n,) parameters to (m,) residuals.
+        residual: function from the (n,) parameters to (m,) residuals.
         start: (n,) first guess within the bounds.
-        lower: (n,) least values, -inf for none; equal bounds hold a parameter fixed.
-        upper: (n,) largest values, inf for none.
-        huber: residual above which a sample counts linearly; None weighs all equally.
-        iterations: at most.
+        lower: (n,) lower bounds, -inf for none; equal bounds fix a parameter.
+        upper: (n,) upper bounds, inf for none.
+        huber: residual above which a sample counts linearly; None weights all samples equally.
+        iterations: maximum number of iterations.
 
     Raises:
-        KinematicsError: start outside the bounds, fewer residuals than parameters, or residuals that are not finite.
+        KinematicsError: start outside the bounds, fewer residuals than parameters, or non-finite residuals.
     """
     point, value = _solve(residual, start, lower, upper, huber, iterations)
     return FitResult(point, _standard_errors(residual, point, lower, upper, value, huber), value)

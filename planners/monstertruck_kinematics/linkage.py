@@ -74,7 +74,7 @@ class SteeringLinkage:
         return 1.0 if self.arms == "forward" else -1.0
 
     def shift(self, servo: Real) -> Real:
-        """Sideways move of the drag link's far end, m, left positive (2.2): towards its servo arm's own swing.
+        """Sideways motion of the drag link's far end, m, left positive (2.2).
 
         S + l_PA sin(theta) - l_DL with S^2 = l_DL^2 - l_PA^2 (1 - cos theta)^2, for both signs of theta (for rearward
         arms of -theta, so that a positive servo angle always steers left).

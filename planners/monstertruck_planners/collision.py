@@ -32,16 +32,17 @@ UnitTwist = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Footprint:
-    """Rectangle around the point that poses refer to (the base), grown by ``padding`` on every side.
+    """Rectangle around the reference point of poses (the base), grown by ``padding`` on every side.
 
     Args:
-        length: along x, m.
-        width: along y, m.
-        padding: added on each side, m.
-        offset: of the rectangle's centre ahead of the poses' point, m; half a wheelbase for poses of the rear axle.
+        length: length along x, m.
+        width: width along y, m.
+        padding: distance added on each side, m.
+        offset: distance of the rectangle's centre ahead of the reference point, m; half a wheelbase for poses of the
+            rear axle.
 
     Raises:
-        InputError: length or width not above zero, or padding below it.
+        InputError: length or width not above zero, or negative padding.
     """
 
     length: float = 0.47
@@ -165,7 +166,7 @@ def rectangle_distance(footprint: Footprint, poses: Array, points: Array) -> Arr
 
 
 def beyond(footprint: Footprint, poses: Array, points: Array) -> tuple[Array, Array]:
-    """How far every point lies beyond the footprint's ends and sides at every pose, each of shape (m, n), m."""
+    """Return the distances of points beyond the footprint's ends and sides at every pose, each of shape (m, n), m."""
     x, y = relative(points, poses)
     return np.abs(x - footprint.offset) - footprint.half_length, np.abs(y) - footprint.half_width
 
@@ -219,7 +220,7 @@ def points_near(points: Array, poses: Array, reach: float) -> Array:
 
 
 def on_body(body: Footprint, points: Array, margin: float) -> NDArray[np.bool_]:
-    """Which points (n, 2) in base lie on the body, or nearer to it than ``margin``, m."""
+    """Return which points (n, 2) in base lie on the body or within ``margin`` of it, m."""
     on: NDArray[np.bool_] = (np.abs(points[:, 0] - body.offset) < body.half_length + margin) & (
         np.abs(points[:, 1]) < body.half_width + margin
     )
@@ -231,20 +232,20 @@ def first_contact(
 ) -> int | None:
     """Return the index of the first pose whose footprint comes within ``margin`` of a point.
 
-    A point that is no nearer than it was at the first pose is no obstacle to this motion: a truck that stands at a
-    wall may leave it. Sideways it still comes nearer to points of the wall that it had ahead: with ``leaving`` these
-    may be as near as the nearest one was at the first pose (half of the padding is kept at least), and so much further
-    away at each pose.
+    A point whose distance does not fall below its distance at the first pose does not obstruct the motion: a truck that
+    stands at a wall may leave it. A sideways motion still comes closer to points of the wall that were ahead. With
+    ``leaving``, the footprint must keep the distance that the nearest of them had at the first pose (at least half of
+    the padding), plus the value of ``leaving`` at each pose.
 
     Args:
         footprint: the rectangle.
-        poses: shape (m, 3), in the order driven, the first one being the current pose.
+        poses: shape (m, 3), in driving order, starting with the current pose.
         points: shape (n, 2), same frame.
         margin: m.
-        leaving: shape (m,), m; None: the margin counts for all points that come nearer.
+        leaving: shape (m,), m; None: the margin applies to all points that come nearer.
 
     Returns:
-        The index, at least 1, or None when all poses are free.
+        The index, at least 1, or None if all poses are free.
     """
     near = points_near(points, poses, footprint.circumscribed_radius + margin)
     if len(near) == 0:

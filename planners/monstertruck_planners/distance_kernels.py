@@ -14,18 +14,18 @@ from numpy.typing import NDArray
 from monstertruck_kinematics.elementary import Array
 
 Box = tuple[int, int, int, int]
-"""First row, first column, and those after the last."""
+"""First row, first column, and the row and column after the last."""
 
 
 @njit(cache=True)
 def _envelope(heights: Array, count: int, places: NDArray[np.int64], borders: Array) -> int:
-    """Parabolas (x - places[k])^2 + heights[places[k]] of the lower envelope; returns their number.
+    """Compute the lower envelope of the parabolas (x - places[k])^2 + heights[places[k]]; return their number.
 
     Args:
-        heights: shape (count,); inf: none.
-        count: see above.
-        places: shape (count,), receives the places of the parabolas on the envelope.
-        borders: shape (count,), receives from where on each is the lowest.
+        heights: shape (count,); inf for no parabola.
+        count: number of heights.
+        places: shape (count,), receives the positions of the parabolas on the envelope.
+        borders: shape (count,), receives the start of the range in which each parabola is the lowest.
     """
     used = 0
     for q in range(count):
@@ -49,17 +49,17 @@ def _envelope(heights: Array, count: int, places: NDArray[np.int64], borders: Ar
 def fill_distances(
     occupied: NDArray[np.bool_], resolution: float, context: Box, box: Box, out: NDArray[np.float32]
 ) -> float:
-    """Write the distances between the centre of each cell of a box and that of the nearest occupied one.
+    """Write the distances from the centres of a box's cells to the centre of the nearest occupied cell.
 
     Args:
         occupied: the grid.
         resolution: m.
-        context: the cells regarded; others count as free.
-        box: within the context.
-        out: the grid's shape; the box is written, m.
+        context: box of the cells that are considered; others count as free.
+        box: box to fill, within the context.
+        out: array with the grid's shape; the box is written, m.
 
     Returns:
-        The greatest one, in cells.
+        The largest distance, in cells.
     """
     top, left, bottom, right = context
     width = right - left
@@ -109,7 +109,7 @@ def _greatest(distance: NDArray[np.float32], box: Box) -> float:
 
 @njit(cache=True)
 def _greatest_at_edge(distance: NDArray[np.float32], box: Box) -> float:
-    """Greatest distance in the outermost cells of a box, but for the sides where it ends with the grid."""
+    """Return the largest distance in the outermost cells of a box, except at sides on the edge of the grid."""
     rows, columns = distance.shape
     greatest = np.float32(0.0)
     for row in range(box[0], box[2]):
@@ -130,19 +130,20 @@ def _grown(box: Box, cells: int, rows: int, columns: int) -> Box:
 def update_distances(
     distance: NDArray[np.float32], occupied: NDArray[np.bool_], resolution: float, changed: Box
 ) -> Box:
-    """Bring distances up to date after cells of a box have changed.
+    """Update distances after cells of a box have changed.
 
-    A cell at least as far from the box as from its nearest obstacle before keeps its distance. Distances differ by no
-    more than the cells' distance, so if that holds all round a larger box it holds everywhere beyond.
+    The distance of a cell is unchanged if the cell was at least as far from the box as from its nearest obstacle.
+    Distances of two cells differ by at most the distance between the cells. If the condition holds all around a larger
+    box, it therefore holds everywhere beyond that box.
 
     Args:
-        distance: right for the cells before, m; changed in place.
-        occupied: the cells after the change.
+        distance: distances before the change, m; updated in place.
+        occupied: cells after the change.
         resolution: m.
-        changed: the box.
+        changed: box of the changed cells.
 
     Returns:
-        The box in which distances were computed again.
+        The box in which distances were recomputed.
     """
     rows, columns = occupied.shape
     reach = 8

@@ -1,4 +1,4 @@
-"""The planners' steps that may be taken elsewhere, in a worker or on another machine, and what travels there."""
+"""Planners' steps that can run in a worker or on another machine, and the messages exchanged with them."""
 
 from typing import Final
 
@@ -31,4 +31,4 @@ CODEC: Final = StepCodec(
     # What ``TrackInput.news`` holds.
     *(Odometry, Path, GateState, LaserScan, Attitude),
 )
-"""Of inputs and outputs of all steps, with the settings of all plug-ins they may hold."""
+"""Codec of inputs and outputs of all steps, and of all plug-in settings that they may contain."""

@@ -1,17 +1,17 @@
 """Tasks: requested activities that end, one of each kind at a time.
 
-A goal, an exploration, a mission and a behaviour (a move is one) are tasks. Every service that does one kind is a
-`Task`; its `TaskServer` handles the common part of all tasks, in this order:
+A goal, an exploration, a mission and a behaviour (including a move) are tasks. Every service that executes one kind is
+a `Task`; its `TaskServer` handles the common part of all tasks:
 
-1. A request is examined: who may ask, whether it is fresh, whether its number has been used.
-2. To start one, nothing else may drive the robot, the service must `accept` the request, and the robot must be armed.
-   That is checked last: a client arms a robot that is refused for nothing else.
-3. It gets the next number and `begin` runs. From then on the service reports by `state`, which the server publishes at
-   once when something of interest changes, and otherwise periodically.
-4. Pause, resume and stop go to `control`; a program may ask for its own task only.
+1. The server checks every request: permission of the sender, age, and sequence number.
+2. A task starts only if nothing else drives the robot, the service accepts the request (`accept`), and the robot is
+   armed. The armed state is checked last, so that a client arms the robot only if nothing else prevents the start.
+3. The task gets the next number, and the server calls `begin`. The service then reports through `state`, which the
+   server publishes at every important change, and otherwise periodically.
+4. Pause, resume and stop go to `control`; a program may restrict them to its own task.
 
-An emergency stop ends a task through the gate's state, which each service observes. A task that a restart interrupted
-is `resumable` where the service keeps its progress.
+Each service observes the gate's state and ends its task on an emergency stop. If the service stores its progress, a
+task that a restart interrupted is `resumable`.
 """
 
 import asyncio
@@ -53,7 +53,7 @@ NOBODY: Final[frozenset[str]] = frozenset()
 
 
 class Task(Protocol[R_contra, P, S_co]):
-    """One kind of task, as the service that does it tells its server."""
+    """One kind of task: the interface of its service to the task server."""
 
     noun: str
     """Name of a task in messages, such as "exploration"."""
@@ -84,22 +84,22 @@ class Task(Protocol[R_contra, P, S_co]):
         """
 
     def state(self, now: int) -> S_co:
-        """The report at ``now``, ns, with sequence number 0."""
+        """Return the report at ``now``, ns, with sequence number 0."""
 
 
 class TaskServer(Generic[R, P, S]):
     """Starts, stops and reports the tasks of one kind.
 
     Args:
-        task: the service that does them.
+        task: service that executes the tasks.
         clock: time.
         gate: latest state of the gate.
         max_age: see ``GateConfig.max_request_age``.
-        out: where they are reported.
+        out: publisher of the reports.
         changes: fields of the report whose change is published at once.
-        period: between reports of a running task without a change, ns.
+        period: period of the reports of a running task without a change, ns.
         others: reports on tasks that exclude these.
-        own: sources whose tasks do not exclude them.
+        own: sources whose tasks do not exclude these.
         replaces: a new task replaces the running one instead of being refused.
         drives: modes of the gate that permit a start.
     """
@@ -134,10 +134,10 @@ class TaskServer(Generic[R, P, S]):
         """Latest report."""
 
     def take(self, request: R) -> int:
-        """Carry out a request; returns the number of the task that it starts, or is about.
+        """Execute a request; return the number of the task that it starts or refers to.
 
         Raises:
-            RequestRefusedError: the sender may not, or it cannot be done now.
+            RequestRefusedError: the sender lacks permission, or the request is impossible now.
             TruckError: the service does not accept it.
         """
         gate, verb = self._gate.latest, request.verb
@@ -154,13 +154,13 @@ class TaskServer(Generic[R, P, S]):
         return self.number
 
     def other(self) -> str | None:
-        """What another source has the robot do, in words."""
+        """Describe the activity that another source has started; None without one."""
         states: list[TaskState | None] = [topic.latest for topic in self._others]
         running = (state for state in states if state is not None and state.running and state.source not in self._own)
         return next((state.activity for state in running), None)
 
     def report(self) -> None:
-        """Publish the state if it has changed, or is due."""
+        """Publish the state if it has changed or a report is due."""
         now, before = self._clock.now(), self.reported
         state = self._task.state(now)
         same = before is not None and all(getattr(before, name) == getattr(state, name) for name in self._changes)
@@ -196,7 +196,7 @@ class TaskServer(Generic[R, P, S]):
             raise RequestRefusedError(Reason.BUSY, f"{activity}, stop it first")
 
     def _require_present(self, request: R) -> None:
-        """Require a task for the request to be about, of the same program if it says so."""
+        """Require a task that the request can refer to, of the same program if the request demands this."""
         if not self._task.running and (request.own or not self._task.resumable):
             raise RequestRefusedError(Reason.NOT_FOUND, f"no {self._task.noun} is running")
         if request.own and request.program != self._program:

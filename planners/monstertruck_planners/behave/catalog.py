@@ -1,4 +1,4 @@
-"""Behaviours by ``kind``: what reacts to sensors directly, without a path; and what keeps the lidar level."""
+"""Catalogs of behaviours, which react to sensors without a path, and of levelling, which keeps the lidar level."""
 
 from typing import Annotated, Final
 
@@ -52,7 +52,7 @@ BEHAVIOURS: Final = Catalog(
     ),
     base=BehaviourConfig,
 )
-"""A behaviour is a ``Behaviour`` made from its settings; it asks for motion through the gate."""
+"""Catalog of behaviours. A behaviour is a ``Behaviour`` made from its settings; it requests motion from the gate."""
 
 AnyBehaviour = Annotated[BehaviourConfig, BEHAVIOURS.section()]
 """One of the configuration's section `behaviours`."""
@@ -66,7 +66,7 @@ LEVELLING: Final = Catalog(
         doc="Keeps the lidar level by the compass",
     ),
 )
-"""Levelling is a function that makes a ``Service`` from its settings, the clock and the bus (a ``BusPort``)."""
+"""Catalog of levelling kinds: functions that build a ``Service`` from settings, clock and bus (a ``BusPort``)."""
 
 AnyLevelling = Annotated[Schema, LEVELLING.section("stabiliser")]
 """The configuration's section `levelling`."""

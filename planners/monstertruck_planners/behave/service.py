@@ -1,4 +1,4 @@
-"""Behaviours as a service: started and stopped by remote call, one at a time; the gate is asked for their motion."""
+"""Service that runs one behaviour at a time, started and stopped by remote calls; it requests motion from the gate."""
 
 import math
 from collections.abc import Mapping
@@ -41,7 +41,7 @@ CHANGES: Final = ("number", "running", "phase", "outcome")
 
 @dataclass(frozen=True, slots=True)
 class BehaviourRun:
-    """A behaviour that runs, or was the last."""
+    """Current or latest run of a behaviour."""
 
     number: int
     name: str
@@ -58,11 +58,11 @@ class BehaviourRun:
     dock: DockTarget | None = None
     travelled: float = 0.0
     disobeyed: int | None = None
-    """Since when the gate does not carry out the requested motion, ns."""
+    """Time since which the gate has not executed the requested motion, ns."""
 
     @property
     def running(self) -> bool:
-        """Whether it runs."""
+        """Whether the behaviour is running."""
         return self.outcome is Reason.DRIVING
 
 
@@ -139,17 +139,17 @@ class BehaviourService:
     # Requests
 
     def check(self, name: str, settings: Mapping[str, Any]) -> None:
-        """Whether a behaviour could be started with these settings, were the robot ready to drive.
+        """Check whether a behaviour with these settings could start if the robot were ready to drive.
 
         Raises:
             NotFoundError: no such behaviour is configured.
-            InputError: the settings are wrong, or not complete; the text names the first key.
-            RequestRefusedError: the body cannot do that.
+            InputError: the settings are wrong or incomplete; the text names the first key.
+            RequestRefusedError: the body cannot execute the behaviour.
         """
         self._configured(name, settings)
 
     def _configured(self, name: str, settings: Mapping[str, Any]) -> tuple[BehaviourConfig, Behaviour]:
-        """The settings of a run, and the behaviour with them. Raises as ``check`` does."""
+        """Return the settings of a run, and the behaviour with them. Raises the errors of ``check``."""
         if name not in self.configs:
             raise NotFoundError(f"no behaviour {name!r}: expected one of {', '.join(self.configs) or 'none'}")
         config = _with_settings(self.configs[name], settings)
@@ -168,12 +168,13 @@ class BehaviourService:
         return self._run is not None and self._run.running
 
     def accept(self, request: BehaviourRequest) -> tuple[BehaviourConfig, Behaviour]:
-        """The settings of a run, and the behaviour with them.
+        """Return the settings of a run, and the behaviour with these settings.
 
         Raises:
             NotFoundError: no such behaviour is configured.
-            InputError: the settings are wrong, or not complete; the text names the first key.
-            RequestRefusedError: the body cannot do that, a path is followed, or an input of the behaviour is missing.
+            InputError: the settings are wrong or incomplete; the text names the first key.
+            RequestRefusedError: the body cannot execute it, the robot follows a path, or an input of the behaviour is
+                missing.
         """
         config, behaviour = self._configured(request.behaviour, request.settings)
         now, gate = self._clock.now(), self._gate.latest
@@ -185,7 +186,7 @@ class BehaviourService:
         return config, behaviour
 
     def begin(self, accepted: tuple[BehaviourConfig, Behaviour], request: BehaviourRequest, number: int) -> None:
-        """Run a behaviour from here on."""
+        """Start a behaviour."""
         name, (config, behaviour) = request.behaviour, accepted
         now = self._clock.now()
         self._run = BehaviourRun(number, name, config, behaviour, request.source, now, behaviour.begin())
@@ -200,7 +201,7 @@ class BehaviourService:
         self._end(self._run, Reason.CANCELLED, f"stopped by {request.source}", self._clock.now())
 
     def _path(self, now: int) -> str | None:
-        """The path that is followed, in words."""
+        """Describe the path that the robot follows; None without one."""
         tracker = self._tracker.latest
         following = tracker is not None and now - tracker.received <= TRACKER.fresh_for() * SECOND
         if following and tracker is not None and tracker.outcome is Reason.DRIVING:
@@ -258,7 +259,7 @@ class BehaviourService:
         return None
 
     def _judged(self, run: BehaviourRun, motion: RequestedMotion, now: int) -> BehaviourRun:
-        """Note since when the gate does not carry out motion that was requested."""
+        """Note the time since which the gate has not executed requested motion."""
         gate = self._gate.latest
         obeyed = gate is not None and gate.mode is GateMode.DRIVING and gate.holder == SOURCE
         if obeyed and gate is not None and gate.twist is not None:
@@ -283,7 +284,7 @@ class BehaviourService:
         self._ask(RequestedMotion(), now)
 
     def _settle(self, now: int) -> None:
-        """Ask for standstill until the robot is at rest, then send nothing."""
+        """Request standstill until the robot is at rest, then send nothing."""
         run, odometry = self._run, self._odometry.latest
         # 1.0: duration of the standstill requests after the end (s)
         if run is None or run.ended is None or now - run.ended > 1.0 * SECOND:
@@ -326,7 +327,7 @@ class BehaviourService:
         )
 
     def register(self, rpc: RpcRegistry) -> None:
-        """Serve ``behave``, and ``behaviours``, the list of those configured."""
+        """Serve ``behave`` and ``behaviours``, which lists the configured behaviours."""
 
         async def behaviours(_: dict[str, Any]) -> dict[str, Any]:
             return {name: {"kind": one.kind, "doc": BEHAVIOURS[one.kind].doc} for name, one in self.configs.items()}
@@ -336,15 +337,15 @@ class BehaviourService:
 
 
 def _reads(behaviour: Any) -> tuple[Topic[Any], ...]:
-    """All topics that a behaviour, or its class, reads or may read."""
+    """Return all topics that a behaviour or its class reads or may read."""
     return (*behaviour.reads, *getattr(behaviour, "may_read", ()))
 
 
 def _with_settings(config: BehaviourConfig, settings: Mapping[str, Any]) -> BehaviourConfig:
-    """Settings with those that are given for one run.
+    """Return the settings, with those given for one run.
 
     Raises:
-        InputError: one of them is wrong; the text names the first.
+        InputError: a given setting is wrong; the text names the first.
     """
     if not settings:
         return config

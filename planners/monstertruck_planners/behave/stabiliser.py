@@ -8,20 +8,21 @@ u = R^T z = (-sin p, sin r cos p, cos r cos p). With M z = (sin a cos b, -sin b,
 
     b = -asin(sin r cos p),   a = -atan2(sin p, cos r cos p).
 
-For tilt about one axis the joint is the opposite angle. For both, a heading of second order remains (4 degrees at
-15 and 15): who uses the scan takes it from the joint angles.
+For tilt about one axis, the joint takes the opposite angle. For tilt about both, a heading of second order remains
+(4 degrees at 15 and 15 degrees); users of the scan compute it from the joint angles.
 
-**Prediction.** A compass reading is old when it comes, and a joint reaches its goal late. While the body rocks by 15
-degrees at 0.5 Hz, each 10 ms of that costs up to half a degree. So the tilt is followed by a filter of
-constant acceleration (the fading-memory polynomial filter of second degree, also called critically damped g-h-k; see
-Brookner, "Tracking and Kalman Filtering Made Easy") and predicted to the instant when the joints will be there.
+**Prediction.** A compass reading is already old on arrival, and a joint reaches its goal late. If the body rocks by 15
+degrees at 0.5 Hz, every 10 ms of delay cause an error of up to half a degree. Therefore a filter with constant
+acceleration (the fading-memory polynomial filter of second degree, also called critically damped g-h-k; see Brookner,
+"Tracking and Kalman Filtering Made Easy") tracks the tilt and predicts it for the time when the joints reach their
+goals.
 
-A filter that forgets quickly follows a body that rocks; on smooth ground it makes three times as much of the compass's
-noise, and of the odometry's (below). So filters of several memories run side by side, and each counts by how well it
-has lately predicted the readings that came ``JUDGED`` readings later.
+A filter with a short memory follows a rocking body, but on smooth ground it triples the noise of the compass and of
+odometry (see below). Therefore several filters with different memories run in parallel, each weighted by its recent
+errors in predicting readings ``JUDGED`` readings ahead.
 
-**Driving.** The body's own acceleration is taken out of the compass's tilt (``monstertruck_estimation.body_tilt``): the
-prediction would make twice as much of it.
+**Driving.** The acceleration of the body is removed from the compass's tilt (``monstertruck_estimation.body_tilt``),
+because the prediction would double its effect.
 """
 
 import math

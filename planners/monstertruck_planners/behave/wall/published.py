@@ -2,7 +2,7 @@
 
 Only the times that were set by hand are replaced: the approach ends by the ranges, the lap by odometry. Ramps keep
 their published weakness: one that a change of phase cuts short jumps to the end value it would have had.
-All is written for a wall on the left; a wall on the right is the mirror image.
+The code assumes a wall on the left; a wall on the right is mirrored.
 """
 
 import math
@@ -36,7 +36,7 @@ class Ranges(NamedTuple):
     diagonal: float
     front: float
     far: float
-    """The diagonal one of the other side."""
+    """Diagonal range on the other side."""
 
 
 def wall_angle(diagonal: float, side: float, offset: float = 0.0) -> float:
@@ -80,7 +80,7 @@ def ramp(begin: float, start: float, end: float, duration: float) -> TimedRamp:
 
 @dataclass(frozen=True, slots=True)
 class WallState:
-    """Between two steps."""
+    """State between two steps."""
 
     phase: Phase = "approach"
     v: TimedRamp | None = None
@@ -90,7 +90,7 @@ class WallState:
     sonars: SonarMonitor = field(default_factory=SonarMonitor)
     pose: tuple[float, float, float] | None = None
     turned: float = 0.0
-    """Rad, both ways counted."""
+    """Accumulated absolute turn, rad."""
     travelled: float = 0.0
     begun: tuple[float, float, float] | None = None
     """Pose where following began."""
@@ -100,19 +100,19 @@ class WallState:
     turned_before: float = 0.0
     """``turned`` when the current phase began, rad."""
     before: tuple[Ranges, ...] = ()
-    """Ranges of the last two steps."""
+    """Ranges at the last two steps."""
     gaps: tuple[float | None, float | None] = (None, None)
-    """``travelled`` when side and diagonal sonar began to look into a gap."""
+    """Values of ``travelled`` at which side and diagonal sonar began to look into a gap."""
     echoes: tuple[tuple[float, float, float], ...] = ()
     """Latest echoes on the wall: x and y by odometry, with the wall on the left, and their ``travelled``, m."""
     asked: float = 0.0
     """Requested speed at the step before, m/s."""
     moving_since: float | None = None
-    """Since when motion is requested but none is measured, s."""
+    """Time since which motion is requested but not measured, s."""
 
 
 class _Wall(ABC):
-    """What both methods share: input checks, odometry, laps, the mirror."""
+    """Base of both methods: input checks, odometry, laps, mirroring."""
 
     reads: ClassVar[tuple[Topic[Any], ...]] = (SONAR, ODOMETRY)
 
@@ -124,7 +124,7 @@ class _Wall(ABC):
 
     @classmethod
     def fit(cls, config: Any, body: BehaviourBody) -> Self:
-        """The behaviour for a body; one that cannot turn on the spot turns away along its tightest arc.
+        """Return the behaviour for a body; a body that cannot turn on the spot turns away along its tightest arc.
 
         Raises:
             KinematicsError: the body cannot turn.
@@ -132,11 +132,11 @@ class _Wall(ABC):
         return cls(config, tightest_curvature(body))
 
     def begin(self) -> WallState:
-        """Before the first step."""
+        """Return the state before the first step."""
         return WallState()
 
     def step(self, inputs: Inputs, state: WallState, t: float) -> BehaviourStep:
-        """One step; see ``Behaviour``."""
+        """Run one step; see ``Behaviour``."""
         sonars, odometry = inputs.of(SONAR), inputs.of(ODOMETRY)
         state = _moved(state, odometry)
         state = replace(state, sonars=state.sonars.observe(sonars, self._names, state.turned, t))
@@ -163,7 +163,7 @@ class _Wall(ABC):
 
     @abstractmethod
     def _drive(self, state: WallState, ranges: Ranges, t: float) -> tuple[WallState, float, float]:
-        """Next state, speed in m/s and yaw rate in rad/s, with the wall on the left."""
+        """Return the next state, speed (m/s) and yaw rate (rad/s), with the wall on the left."""
 
     def _distance(self, ranges: Ranges) -> float:
         return ranges.side
@@ -193,7 +193,7 @@ class _Wall(ABC):
         )
 
     def _lap(self, state: WallState, t: float) -> WallState:
-        """Count a lap when the robot is back; after the last one begin to stop."""
+        """Count a lap when the robot has returned to its start; begin to stop after the last lap."""
         config, begun, pose = self._shared, state.begun, state.pose
         if begun is None or pose is None or state.phase == "stop" or state.since < config.lap_length:
             return state
@@ -288,10 +288,11 @@ class WallPd(_Wall):
         return line_gains[0] * error + line_gains[1] * away
 
     def _gaps(self, state: WallState, ranges: Ranges) -> WallState:
-        """Which sonars look into a gap: from a jump up on, until they measure the wall again or it is too long.
+        """Find the sonars that look into a gap: from a jump of the range until the wall or the maximum gap length.
 
-        A jump down out of no known gap ends a niche that it started beside: its echoes were none of the wall. Where it
-        begins, a diagonal range much longer than that along a wall is one into a gap as well.
+        A drop of the range without a known gap ends a niche beside which the robot started; the echoes of the niche are
+        discarded. If the diagonal range at the start is much longer than along a wall, that sonar looks into a gap as
+        well.
         """
         before, (side, diagonal), now = state.before, state.gaps, state.travelled
         # growth of the range of the side sonar over two steps, and of the diagonal one over one, by which it begins to
@@ -387,7 +388,7 @@ def _moved(state: WallState, odometry: Odometry) -> WallState:
 
 
 def _stall_timed(state: WallState, speed: float, t: float) -> WallState:
-    """Since when the robot stands although it was asked to drive."""
+    """Note the time since which the robot stands although motion is requested."""
     at_rest = 0.01  # m/s
     stalled = state.asked > at_rest * 5 and abs(speed) < at_rest
     if not stalled:
