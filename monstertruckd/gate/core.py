@@ -413,7 +413,7 @@ class Gate:
         return self._refuse_order(now, blocks[0], request, causes_text(causes, now))
 
     def _refuse_moving(self, now: int, request: ControlRequest) -> Decision | None:
-        """Refuse an order while the robot may move or an operator requests motion; None otherwise."""
+        """Return a refusal while the robot may move or an operator requests motion; None otherwise."""
         if not self._at_rest(now):
             speed = self._samples.speed(now)
             if speed is None:

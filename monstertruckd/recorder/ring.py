@@ -134,7 +134,7 @@ class _Part:
         return self._count
 
     def append(self, entry: LogEntry) -> bool:
-        """Append an entry; return whether that took a new block."""
+        """Append an entry; return whether it needed a new block."""
         topic, log_time, stamp, sequence, payload = entry
         length = len(payload)
         grown = not self._blocks or self._blocks[-1].used + _HEAD.size + length > len(self._blocks[-1].data)

@@ -90,7 +90,7 @@ class ExploringStep:
 
 
 def zoned(grid: Grid, layer: ZoneLayer, margin: float) -> Grid:
-    """Return a grid with the cells of keepout zones occupied: no viewpoint and no way there, and nothing to find."""
+    """Return a grid with the cells of keepout zones occupied, so that no viewpoint, path or frontier lies there."""
     if not layer.shapes:
         return grid
     origin = (grid.origin.x, grid.origin.y, grid.origin.yaw)
