@@ -1,9 +1,10 @@
 """5.1 Kinematics: odometry's error and the turning radius for each manoeuvre, whole daemon, open-loop requests.
 
 The truck drives in the empty hall, on the virtual clock and through all emulated devices, with servos in whole degrees.
-Truth is the world's. The radius is that of the true poses at constant angles, compared with the formula; the speed
-ratio is the true distance over odometry's. The formulas alone: the slip of wheels at 1 m/s if they turned and rolled
-according to the formulas, and an axle angle converted by the linkage and back.
+Truth is the world's. The radius is that of the true poses at constant angles, compared with the formula for the angles
+that the servo pulses reach; the formula for the requested angles is shown beside it. The speed ratio is the true
+distance over odometry's. The formulas alone: the slip of wheels at 1 m/s if they turned and rolled according to the
+formulas, and an axle angle converted by the linkage and back.
 """
 
 import math
@@ -63,14 +64,19 @@ def run(options: Options) -> Part:
                 part.add(f"{name}.{key}", score[key])
             part.add(f"{name}.speed_ratio", score["driven_m"] / scoring.length(row["odometry"]))
         _, front, rear = legs[0]
-        bend = (math.tan(front) - math.tan(rear)) / TRUCK.wheelbase
         if name.startswith("circle"):
+            reached = radius(*config_of().chassis().reached((front, rear)))
             part.add(f"{name}.radius_m", row["radius"])
-            part.add(f"{name}.radius_formula_m", math.hypot(1 / bend, 0.16 if rear == 0.0 else 0.0))
-            off = row["radius"] / part.figures[f"{name}.radius_formula_m"] - 1.0
-            part.add(f"{name}.radius_off_share", abs(off), 0.05)
+            part.add(f"{name}.radius_formula_m", radius(front, rear))
+            part.add(f"{name}.radius_reached_m", reached)
+            part.add(f"{name}.radius_off_share", abs(row["radius"] / reached - 1.0), 0.05)
     draw(options, rows)
     return part
+
+
+def radius(front: float, rear: float) -> float:
+    """Return the turning radius of the truck's centre by the formula (m)."""
+    return float(1.0 / TRUCK.curvature(front, rear))
 
 
 def formulas(part: Part) -> None:
@@ -90,9 +96,13 @@ def formulas(part: Part) -> None:
         part.add(f"formulas.{name}_servo_round_trip_rad", float(np.abs(there_and_back - front).max()), 1e-6)
 
 
+def config_of() -> SimulatedTruckConfig:
+    """Return the configuration of the truck."""
+    return load_config(CONFIGS / "demo.yaml", SimulatedTruckConfig)[0]
+
+
 def drive(legs: list[tuple[float, float, float]]) -> dict[str, Any]:
     """Return true and estimated poses (n, 3) of the same instants, and the true radius of the first leg."""
-    config = load_config(CONFIGS / "demo.yaml", SimulatedTruckConfig)[0]
     overlay = {
         "path": None,
         "map": None,
@@ -100,7 +110,7 @@ def drive(legs: list[tuple[float, float, float]]) -> dict[str, Any]:
         "blackbox": None,
         "sim": {"world": {"map": "hall", "start": START}},
     }
-    config = with_overlay(config, overlay | {"odometry": {"start": START}})
+    config = with_overlay(config_of(), overlay | {"odometry": {"start": START}})
     seen: list[tuple[float, ...]] = []
 
     def note(_topic: object, message: Any, *_: object) -> None:
