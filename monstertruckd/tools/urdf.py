@@ -7,6 +7,7 @@ wheels on the ground, so mounts are shifted by that.
 import math
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.outside import reading, text_of
+from monstertruck_runtime.outside import contents, quoted, reading, text_from
 from monstertruck_runtime.small_files import MEGABYTE
 
 EXPECTED: Final = "URDF"
@@ -41,6 +42,8 @@ class UrdfRobot:
     """Settings of ``geometry``, m."""
     mounts: dict[str, dict[str, float]]
     """Mounts by device: ``x``, ``y``, ``z`` (m), ``yaw``, ``pitch``, ``roll`` (rad), without those that are 0."""
+    remarks: tuple[str, ...] = ()
+    """Warnings about the file."""
 
     def sections(self) -> dict[str, Any]:
         """Return the sections of a configuration."""
@@ -57,8 +60,10 @@ def load_urdf(file: Path, links: Mapping[str, str] | None = None) -> UrdfRobot:
     Raises:
         InputError: not URDF, no four wheels, or no such link; names the expectation.
     """
-    text = text_of(file, EXPECTED, 10 * MEGABYTE)
     with reading(file, EXPECTED):
+        data = contents(file, EXPECTED, 10 * MEGABYTE)
+        declared = re.match(rb"<\?xml[^>]*encoding=[\"'](?!utf-?8)([\w-]+)", data, re.IGNORECASE)
+        text = data.decode(declared[1].decode()) if declared else text_from(data, file, EXPECTED)
         if "<!" in re.sub(r"<!--.*?-->|<!DOCTYPE\s+\w+\s*>", "", text, flags=re.DOTALL):
             raise InputError(f"{file}: declares entities: expected URDF without them")
         root = ET.fromstring(text)  # noqa: S314 - without entities
@@ -70,9 +75,10 @@ def load_urdf(file: Path, links: Mapping[str, str] | None = None) -> UrdfRobot:
         wheels = _wheels(root, frames, file)
     geometry, centre = _geometry(root, frames, wheels, file)
     chosen = _sensors(frames, dict(links or {}), file)
-    return UrdfRobot(
-        root.get("name", ""), geometry, {role: _mount(frames[link], centre) for role, link in chosen.items()}
-    )
+    meshes = [link for link in frames if any(shape.tag == "mesh" for shape, _ in _shapes(root, link, file))]
+    remark = f"{file}: size of {', '.join(meshes)[:200]} unknown (mesh): check geometry.length and geometry.width"
+    mounts = {role: _mount(frames[link], centre) for role, link in chosen.items()}
+    return UrdfRobot(root.get("name", ""), geometry, mounts, (remark,) if meshes else ())
 
 
 def _frames(root: ET.Element, file: Path) -> dict[str, Matrix]:
@@ -82,7 +88,7 @@ def _frames(root: ET.Element, file: Path) -> dict[str, Matrix]:
         parent, child = (_named(joint, kind, file) for kind in ("parent", "child"))
         if child in parents:
             raise InputError(f"{file}: link {child} has two parents")
-        parents[child] = (parent, _origin(joint))
+        parents[child] = (parent, _origin(joint, f"{file}: joint {joint.get('name')}"))
     found: dict[str, Matrix] = {}
     for name in (link.get("name", "") for link in root.findall("link")):
         matrix, at, passed = np.eye(4), name, {name}
@@ -103,11 +109,11 @@ def _named(joint: ET.Element, kind: str, file: Path) -> str:
     return element.get("link", "")
 
 
-def _origin(element: ET.Element) -> Matrix:
+def _origin(element: ET.Element, where: str) -> Matrix:
     """The element's origin as a matrix, shape (4, 4)."""
     origin = element.find("origin")
-    xyz, rpy = ("0 0 0" if origin is None else origin.get(key, "0 0 0") for key in ("xyz", "rpy"))
-    (x, y, z), (roll, pitch, yaw) = _triple(xyz), _triple(rpy)
+    xyz, rpy = ((0.0, 0.0, 0.0) if origin is None else _numbers(origin, key, where, "0 0 0") for key in ("xyz", "rpy"))
+    (x, y, z), (roll, pitch, yaw) = xyz, rpy
     (cr, sr), (cp, sp), (cy, sy) = ((math.cos(angle), math.sin(angle)) for angle in (roll, pitch, yaw))
     return np.array(
         (
@@ -119,20 +125,31 @@ def _origin(element: ET.Element) -> Matrix:
     )
 
 
-def _triple(text: str) -> tuple[float, float, float]:
-    x, y, z = (float(word) for word in text.split())
-    if not all(map(math.isfinite, (x, y, z))):
-        raise ValueError(f"{text}: expected finite numbers")
-    return x, y, z
+def _numbers(element: ET.Element, key: str, where: str, default: str = "") -> tuple[float, ...]:
+    """Three finite numbers of an attribute."""
+    text = element.get(key, default)
+    with suppress(ValueError):
+        numbers = tuple(float(word) for word in text.split())
+        if len(numbers) == len("xyz") and all(map(math.isfinite, numbers)):
+            return numbers
+    raise InputError(f"{where}: {key}: expected three numbers, found {quoted(repr(text))}")
 
 
-def _shapes(root: ET.Element, link: str) -> Iterator[tuple[ET.Element, Matrix]]:
+def _size(shape: ET.Element, key: str, where: str) -> float:
+    text = shape.get(key, "")
+    with suppress(ValueError):
+        if 0.0 < (size := float(text)) < math.inf:
+            return size
+    raise InputError(f"{where}: {key}: expected metres > 0, found {quoted(repr(text))}")
+
+
+def _shapes(root: ET.Element, link: str, file: Path) -> Iterator[tuple[ET.Element, Matrix]]:
     """Shapes of a link, and their places in its frame: those for collisions, else those for viewers."""
     for kind in ("collision", "visual"):
         parts = [part for row in root.findall("link") if row.get("name") == link for part in row.findall(kind)]
         for part in parts:
             for shape in part.findall("geometry/*"):
-                yield shape, _origin(part)
+                yield shape, _origin(part, f"{file}: link {link}")
         if parts:
             return
 
@@ -140,17 +157,21 @@ def _shapes(root: ET.Element, link: str) -> Iterator[tuple[ET.Element, Matrix]]:
 def _wheels(root: ET.Element, frames: Mapping[str, Matrix], file: Path) -> dict[str, tuple[Matrix, float, float]]:
     """Places, radii and widths of the wheels: links on a turning joint that are round about y of the robot."""
     found: dict[str, tuple[Matrix, float, float]] = {}
+    others: dict[str, str] = {}
     for joint in root.findall("joint"):
         link = _named(joint, "child", file)
         if joint.get("type") not in ("continuous", "revolute"):
             continue
-        for shape, place in _shapes(root, link):
+        for shape, place in _shapes(root, link, file):
             axis = (frames[link] @ place)[:3, 2]
             if shape.tag == "cylinder" and abs(axis[1]) > 0.9:  # cosine: within 26 degrees
-                radius, width = (float(shape.get(name, "")) for name in ("radius", "length"))
+                radius, width = (_size(shape, name, f"{file}: link {link}") for name in ("radius", "length"))
                 found[link] = ((frames[link] @ place)[:3, 3], radius, width)
+            else:
+                others[link] = shape.tag
     if len(found) != 4:
         names = ", ".join(found) or "none"
+        names += "".join(f"; {link} is a {shape}" for link, shape in others.items() if link not in found)[:200]
         raise InputError(f"{file}: expected four wheels (cylinders about y on turning joints), found {names}")
     return found
 
@@ -176,9 +197,9 @@ def _geometry(
     reach = np.array((radius, max(width for *_, width in wheels.values()) / 2))
     low, high = places[:, :2].min(0) - reach, places[:, :2].max(0) + reach
     for link, frame in frames.items():
-        for shape, place in _shapes(root, link):
+        for shape, place in _shapes(root, link, file):
             if shape.tag == "box":
-                half = np.abs((frame @ place)[:2, :3]) @ (np.array(_triple(shape.get("size", ""))) / 2)
+                half = np.abs((frame @ place)[:2, :3]) @ (np.array(_numbers(shape, "size", f"{file}: link {link}")) / 2)
                 middle = (frame @ place)[:2, 3]
                 low, high = np.minimum(low, middle - half), np.maximum(high, middle + half)
     centre = np.array((*(0.5 * (places.min(0) + places.max(0)))[:2], places[:, 2].mean() - radius))

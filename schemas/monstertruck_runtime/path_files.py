@@ -17,7 +17,7 @@ from ruamel.yaml.error import YAMLError
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.outside import quoted, reading
 from monstertruck_runtime.path_forms import PathForm
-from monstertruck_runtime.tables import COMMENT, DELIMITERS, rows_of
+from monstertruck_runtime.tables import COMMENT, cells_of, delimiter_of, rows_of
 from monstertruck_runtime.yaml_files import bounded_yaml, yaml_text
 from monstertruck_schemas.mission import Mission
 from monstertruck_schemas.plan import MAX_POSES, Path
@@ -32,6 +32,9 @@ COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
     "speed": ("speed", "speed_mps", "v", "v_mps", "vx", "vx_mps", "vx_racetraj_mps", "velocity"),
 }
 """Names of a column in the formats of other programs."""
+_UNIT: Final = re.compile(r"(\w+)\s*[\[(]\s*(.*?)\s*[\])]")
+"""A column's name with its unit in brackets."""
+_UNITS: Final = ("m", "rad", "m/s", "1")
 _SHIFTED: Final = ("x_ref_m", "y_ref_m", "x_normvec_m", "y_normvec_m", "alpha_m")
 """TUM's trajectory for a local planner: reference line, its normals, and the shift along them."""
 EXPECTED: Final = "a path"
@@ -51,7 +54,7 @@ def path_from(text: str, file: FilePath, *, closed: bool, frame: str = "odom", c
 
     Args:
         text: text of the file.
-        file: file name; its suffix distinguishes table and YAML.
+        file: file name; its suffix distinguishes table and YAML (or JSON).
         closed: whether the path is a lap.
         frame: frame of its poses.
         columns: column names of a table, which replace those in the file.
@@ -149,7 +152,7 @@ def _waypoint(x: float, y: float, yaw: float) -> dict[str, list[float]]:
 
 
 def _is_yaml(file: FilePath) -> bool:
-    return file.suffix.lower() in (".yaml", ".yml")
+    return file.suffix.lower() in (".yaml", ".yml", ".json")
 
 
 # Tables
@@ -160,14 +163,18 @@ def _table(text: str, file: FilePath, columns: Sequence[str], *, closed: bool) -
     rows = rows_of(text, file, EXPECTED)
     if not rows:
         raise InputError(f"{file}: expected {EXPECTED}: the file is empty")
-    names, start = _names(text, rows, columns)
+    given, start = _names(text, rows, columns)
+    names = [_plain(name, file, rows[0][0]) for name in given]
+    for name in names:
+        if name and names.count(name) > 1:
+            raise InputError(f"{file}:{rows[0][0]}: expected one column {name}, found {names.count(name)}")
     numbers = np.array([_numbers(file, line, cells, names) for line, cells in rows[start:]]).reshape(-1, len(names))
     found = dict(zip(names, numbers.T, strict=True))
     speeds = next((found[name] for name in COLUMNS["speed"] if name in found), np.zeros(0))
     _require(speeds >= 0.0, "a speed of zero or more", file, rows[start:])
-    if tuple(names[: len(HEADER)]) == HEADER:
+    if found.keys() >= set(HEADER):
         _require(np.abs(found["direction"]) == 1.0, "a direction of 1 or -1", file, rows[start:])
-        return numbers[:, :3], found["direction"], speeds
+        return np.column_stack([found[name] for name in HEADER[:3]]), found["direction"], speeds
     if all(name in found for name in _SHIFTED):
         x, y, nx, ny, shift = (found[name] for name in _SHIFTED)
         points = np.column_stack((x + shift * nx, y + shift * ny))
@@ -208,11 +215,20 @@ def _names(text: str, rows: list[tuple[int, list[str]]], columns: Sequence[str])
         return [cell.lower() for cell in cells], 1
     for line in reversed(text.removeprefix("\ufeff").splitlines()[: first - 1]):
         comment = line.strip().lstrip(COMMENT)
-        delimiter = max(DELIMITERS, key=comment.count)
-        names = [name.strip().lower() for name in comment.split(delimiter)]
+        names = [name.lower() for name in cells_of(comment, delimiter_of(comment))]
         if line.strip().startswith(COMMENT) and len(names) == len(cells):
             return names, 0
     return ["x", "y"] if len(cells) == 2 else [f"column {i + 1}" for i in range(len(cells))], 0
+
+
+def _plain(name: str, file: FilePath, line: int) -> str:
+    """A column's name without its unit: ``x`` of ``x [m]``."""
+    found = _UNIT.fullmatch(name)
+    if found is None or not any(found[1] in names for names in (HEADER, *COLUMNS.values())):
+        return name
+    if found[2] not in _UNITS:
+        raise InputError(f"{file}:{line}: column {name}: expected one of the units {', '.join(_UNITS)}")
+    return found[1]
 
 
 def _is_number(cell: str) -> bool:
@@ -289,6 +305,8 @@ def _pose(row: Any, where: str) -> tuple[float, float, float]:
     yaw = next((place[name] for name in ("yaw", "theta") if name in place), None)
     if yaw is None:
         raise InputError(f"{where}: expected a yaw (rad) or an orientation")
+    if isinstance(yaw, int | float) and math.isfinite(yaw) and abs(yaw) > math.tau:
+        raise InputError(f"{where}: yaw {yaw:g}: expected radians from -2 pi to 2 pi")
     return _finite(where, place["x"], place["y"], yaw)
 
 
@@ -304,7 +322,7 @@ def _yaw(w: float, x: float, y: float, z: float) -> float:
 
 def _finite(where: str, *values: Any) -> tuple[float, float, float]:
     if not all(isinstance(value, int | float) and math.isfinite(value) for value in values):
-        raise InputError(f"{where}: expected finite numbers, found {quoted(','.join(map(str, values)))}")
+        raise InputError(f"{where}: expected finite numbers, found {quoted(', '.join(map(repr, values)))}")
     x, y, yaw = (float(value) for value in values)
     return x, y, yaw
 

@@ -9,6 +9,7 @@ import typer
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.extras import needs_extra
 from monstertruckd.tools.cli.options import ConfigArgument
+from monstertruckd.tools.cli.output import remark
 
 if TYPE_CHECKING:
     from monstertruck_kinematics.description import Description, Mechanics
@@ -68,7 +69,10 @@ def import_urdf(
     chosen = dict(word.split("=", 1) for word in links or () if "=" in word)
     if len(chosen) < len(links or ()) or not chosen.keys() <= SENSORS.keys():
         raise InputError(f"--link: expected DEVICE=LINK once for each device, which is one of {', '.join(SENSORS)}")
-    text = yaml_text(load_urdf(file, chosen).sections())
+    robot = load_urdf(file, chosen)
+    for text in robot.remarks:
+        remark(text)
+    text = yaml_text(robot.sections())
     if output is None:
         typer.echo(text, nl=False)
     else:

@@ -83,6 +83,20 @@ def test_our_own_table_may_have_speeds():
     found = read("x,y,yaw,direction,speed\n0,0,1,1,.2\n1,0,1,-1,.1\n")
     assert poses(found).tolist() == [[0, 0, 1], [1, 0, 1]]
     assert (found.directions.tolist(), found.speeds.tolist()) == ([1, -1], [0.2, 0.1])
+    swapped = read("direction,x,y,yaw\n1,0,0,1\n-1,1,0,1\n")
+    assert (poses(swapped).tolist(), swapped.directions.tolist()) == ([[0, 0, 1], [1, 0, 1]], [1, -1])
+
+
+def test_a_table_of_numpy_is_read():
+    assert poses(read("# x y v\n0.00e+00 0.00e+00 1.00e+00\n1.00e+00 0.00e+00 5.00e-01\n")).tolist() == [
+        [0, 0, 0],
+        [1, 0, 0],
+    ]
+
+
+def test_waypoints_may_be_json():
+    found = poses(read('{"waypoints": [{"x": 0, "y": 0, "yaw": 0}, {"x": 1, "y": 0, "yaw": 0}]}', "way.json"))
+    assert found[-1].tolist() == pytest.approx([1, 0, 0])
 
 
 def test_waypoints_of_nav2_become_a_curve_through_their_headings():
@@ -113,6 +127,7 @@ def test_a_path_of_ros_is_taken_as_it_is():
         ("p.yaml", "steps: []\n", r"p\.yaml: expected a mapping with waypoints"),
         ("p.yaml", "waypoints: [{latitude: 1, longitude: 2}]\n", r"waypoints 0: has a latitude"),
         ("p.yaml", "waypoints: [{x: 1, y: 2}]\n", r"waypoints 0: expected a yaw \(rad\) or an orientation"),
+        ("p.yaml", "waypoints: [{x: 1, y: 2, yaw: 90}]\n", r"waypoints 0: yaw 90: expected radians from -2 pi to 2 pi"),
         ("p.yaml", "waypoints: [{yaw: 1}]\n", r"waypoints 0: expected x and y"),
         ("p.yaml", "waypoints: [{x: .inf, y: 2, yaw: 1}]\n", r"waypoints 0: expected finite numbers, found inf"),
         ("p.yaml", "waypoints:\n  a: {pose: [0, 0, 0], orientation: [1]}\n", r"waypoints a: expected an orientation"),

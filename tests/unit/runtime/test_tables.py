@@ -21,6 +21,11 @@ ROWS = [(1, ["x", "y"]), (2, ["1", "2"])]
         (b"x , y\n 1, 2 \n  \n", ROWS),
         (b"# made by hand\n\nx,y\n# begin\n1,2\n,,\n", [(3, ["x", "y"]), (5, ["1", "2"])]),
         (b'"x","y"\n1,2\n', ROWS),
+        (b"sep=;\r\nx;y\r\n1;2\r\n", [(2, ["x", "y"]), (3, ["1", "2"])]),
+        (b"x y\n1   2\n", ROWS),
+        (b"x,y,\n1,2,\n", ROWS),
+        (b"x;y\n1,5;-2,5e-1\n", [(1, ["x", "y"]), (2, ["1.5", "-2.5e-1"])]),
+        (b"0,5;1,0;2,0\n", [(1, ["0.5", "1.0", "2.0"])]),
         (b"", []),
     ],
 )
@@ -33,7 +38,9 @@ def test_marks_empty_lines_comments_and_delimiters(tmp_path: Path, data: bytes, 
     ("data", "text"),
     [
         (b"x,y,yaw,direction\n0,0,0,1\n1,a,0,1\n", r"p\.csv:3: expected numbers, found 1,a,0,1"),
-        (b"x;y;yaw;direction\n0;0;0;1\n1,5;0;0;1\n", r"p\.csv:3: expected numbers, found 1,5,0,0,1"),
+        (b"x;y;yaw;direction\n0;0;0;1\n1.000,5;0;0;1\n", r"p\.csv:3: expected numbers, found 1\.000,5,0,0,1"),
+        (b"x,y,x\n0,0,5\n1,0,5\n", r"p\.csv:1: expected one column x, found 2"),
+        (b"x [mm],y [mm]\n0,0\n1,0\n", r"p\.csv:1: column x \[mm\]: expected one of the units m, rad, m/s"),
         (b"\n# path\na,b\n", r"p\.csv:3: expected columns x,y,yaw,direction, or x_m and y_m .*; found a,b"),
         (b"", r"p\.csv: expected a path: the file is empty"),
         (b"x,y,yaw,direction\n\xff\n", r"p\.csv:2: expected a path: not UTF-8 text"),
@@ -45,7 +52,8 @@ def test_a_path_names_what_it_met(tmp_path: Path, data: bytes, text: str):
         load_path(tmp_path / "p.csv", closed=False)
 
 
-def test_a_path_of_a_spreadsheet_is_read(tmp_path: Path):
-    (tmp_path / "p.csv").write_bytes(b"\xef\xbb\xbfx;y;yaw;direction\r\n0;0;0;1\r\n0.5;0;0;1\r\n\r\n")
+@pytest.mark.parametrize("head", [b"x;y;yaw;direction", b"X [m];Y (m);yaw [rad];direction"])
+def test_a_path_of_a_spreadsheet_is_read(tmp_path: Path, head: bytes):
+    (tmp_path / "p.csv").write_bytes(b"\xef\xbb\xbf" + head + b"\r\n0;0;0;1\r\n0,5;0;0;1\r\n\r\n")
     path = load_path(tmp_path / "p.csv", closed=False)
     assert list(path.poses) == [0.0, 0.0, 0.0, 0.5, 0.0, 0.0]

@@ -98,10 +98,36 @@ def test_the_command_writes_sections_of_a_configuration(tmp_path: Path):
         (ROVER.replace('xyz="0.25 0.1 ', 'xyz="-0.05 0.1 '), "expected a wheel at each corner"),
         (ROVER.replace('<child link="chassis"/>', ""), "joint base: expected a child link"),
         (ROVER.replace('<parent link="base_footprint"/>', '<parent link="camera_link"/>'), "is its own parent"),
-        (ROVER.replace('xyz="0.2 0 0.15"', 'xyz="0.2 nan 0.15"'), "expected finite numbers"),
+        (
+            ROVER.replace('xyz="0.2 0 0.15"', 'xyz="0.2 nan 0.15"'),
+            "joint scan: xyz: expected three numbers, found '0.2 nan 0.15'",
+        ),
+        (
+            ROVER.replace('xyz="0.2 0 0.15"', 'xyz="0,2 0 0.15"'),
+            "joint scan: xyz: expected three numbers, found '0,2 0 0.15'",
+        ),
+        (ROVER.replace('radius="0.05"', 'radius="-1"'), "link wheel_1_1: radius: expected metres > 0, found '-1'"),
+        (ROVER.replace('size="0.4 0.2 0.1"', 'size="0.4"'), "link chassis: size: expected three numbers, found '0.4'"),
+        (
+            ROVER.replace('<cylinder radius="0.05" length="0.04"/>', '<mesh filename="wheel.stl"/>'),
+            "expected four wheels .*, found none; wheel_1_1 is a mesh; wheel_1_-1 is a mesh",
+        ),
         (ROVER.replace('<child link="camera_link"/>', '<child link="base_scan"/>'), "base_scan has two parents"),
     ],
 )
 def test_what_is_no_robot_of_ours_is_refused(tmp_path: Path, text: str, refusal: str):
     with pytest.raises(InputError, match=rf"rover\.urdf: .*{refusal}"):
         load_urdf(written(tmp_path, text))
+
+
+def test_a_file_in_the_encoding_that_it_declares_is_read(tmp_path: Path):
+    text = ROVER.replace('<?xml version="1.0"?>', '<?xml version="1.0" encoding="ISO-8859-1"?><!-- Größe -->')
+    (tmp_path / "rover.urdf").write_bytes(text.encode("latin-1"))
+    assert load_urdf(tmp_path / "rover.urdf") == load_urdf(written(tmp_path))
+
+
+def test_a_mesh_whose_size_is_unknown_is_named(tmp_path: Path):
+    file = written(tmp_path, ROVER.replace('<box size="0.4 0.2 0.1"/>', '<mesh filename="chassis.stl"/>'))
+    done = CliRunner().invoke(app, ["import-urdf", str(file)])
+    assert done.exit_code == 0, done.output
+    assert "size of chassis unknown (mesh): check geometry.length and geometry.width" in done.stderr
