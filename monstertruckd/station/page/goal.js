@@ -124,6 +124,7 @@ export class Goals {
     byId("goal-pause").hidden = pending || !running || state.phase === "paused";
     byId("goal-resume").hidden = pending || state?.phase !== "paused";
     byId("goal-cancel").hidden = pending || !running;
+    byId("goal-go").disabled = byId("path-go").disabled = this.link.newest.gate?.mode === "estopped";
     byId("goal-go").textContent = words(this.link.newest.gate?.mode === "disarmed" ? "goal.arm" : "goal.go");
     const text = this.text(state, running);
     if (byId("goal-text").textContent !== text) byId("goal-text").textContent = text;

@@ -1,6 +1,7 @@
 // Missions drawn on the map: waypoints that are placed, turned, dragged and removed, then driven in their order, watched, or kept as a file.
 import { byId, element } from "./dom.js";
 import { towards } from "./goal.js";
+import { give } from "./mapfile.js";
 import { degrees, number, words } from "./words.js";
 
 const MOST = 100; // waypoints
@@ -115,9 +116,7 @@ export class MissionTool {
   /** Give the mission to the browser as a file, which the command line runs, too. */
   keep() {
     const { mission } = this;
-    const url = URL.createObjectURL(new Blob([missionText(mission)], { type: "application/yaml" }));
-    element("a", { href: url, download: `${mission.name}.yaml` }).click();
-    URL.revokeObjectURL(url);
+    give(`${mission.name}.yaml`, missionText(mission));
   }
 
   show() {

@@ -171,9 +171,17 @@ export class Panels {
     if (!stands) return;
     const cause = stop.causes[0];
     const seconds = number(Math.max((gate.stamp - stop.stamp) / 1e9, 0), 0);
-    const remedy = words(`remedy.${stop.reason}`);
-    const text = words("stopped", { time: this.dateOf(stop.stamp).toLocaleTimeString(), seconds, why: cause.text || reason(cause.reason), source: cause.source });
-    setText("stopped", remedy === `remedy.${stop.reason}` ? text : `${text} ${remedy}`);
+    const own = stop.reason === "estop_requested" && cause.source === this.source;
+    const key = own ? gate.mode : stop.reason;
+    const remedy = words(`remedy.${key}`);
+    const text = words("stopped", { time: this.dateOf(stop.stamp).toLocaleTimeString(), seconds, why: own ? words("stopped.you") : this.why(cause) });
+    setText("stopped", remedy === `remedy.${key}` ? text : `${text} ${remedy}`);
+  }
+
+  /** The text of a cause with its source, which some texts name. */
+  why({ text, reason: code, source }) {
+    const why = text || reason(code);
+    return why.includes(source) ? why : words("stopped.by", { why, source });
   }
 
   /** When a stamp of the robot's clock was, by the newest state of the gate and when it came. */

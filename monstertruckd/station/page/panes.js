@@ -11,7 +11,9 @@ function choose(tab) {
     each.setAttribute("aria-selected", String(chosen));
     each.tabIndex = chosen ? 0 : -1;
     if (chosen) each.scrollIntoView({ block: "nearest", inline: "nearest" });
-    byId(each.getAttribute("aria-controls")).hidden = !chosen;
+    const pane = byId(each.getAttribute("aria-controls"));
+    pane.hidden = !chosen;
+    if (chosen) pane.scrollIntoView({ block: "nearest" });
   }
 }
 

@@ -377,10 +377,16 @@ def _read(path: Path, options: ReadOptions) -> "ScanLog":
         scan = log.scans[0]
         first, step = math.degrees(scan.start_angle), math.degrees(scan.angle_increment)
         x, y, yaw = scan.mount
+        values = {
+            "start_angle": f"first beam at {first:g} degrees",
+            "angle_increment": f"{len(scan.ranges)} beams {step:g} degrees apart",
+            "range_min": f"returns from {scan.range_min:g} m on",
+            "range_max": f"no return from {scan.range_max:g} m on",
+            "time_increment": f"{scan.time_increment:g} s between beams",
+            "mount": f"lidar at x {x:g}, y {y:g} m, yaw {math.degrees(yaw):g} degrees",
+        }
         remark(
-            f"{path}: contains no {', '.join(log.assumed)}; assuming {len(scan.ranges)} beams from "
-            f"{first:g} degrees, {step:g} degrees apart, no return from {scan.range_max:g} m on, lidar at "
-            f"x {x:g}, y {y:g} m, yaw {math.degrees(yaw):g} degrees"
+            f"{path}: contains no {', '.join(log.assumed)}; assuming {', '.join(values[name] for name in log.assumed)}"
         )
     return log
 

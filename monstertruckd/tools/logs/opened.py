@@ -55,8 +55,10 @@ class OpenedLog:
         return f"<log {self._reader.path}>"
 
     def topics(self) -> dict[str, int]:
-        """Number of messages by topic."""
-        return {name: row["messages"] for name, row in info(self._reader.path)["topics"].items()}
+        """Return the number of messages by topic; only ``map build`` reads topics of other programs."""
+        found = info(self._reader.path)
+        self._warn(found["damage"])
+        return {name: row["messages"] for name, row in found["topics"].items()}
 
     def config(self) -> dict[str, Any]:
         """Recorded configuration of the robot; empty if there is none."""
@@ -65,7 +67,7 @@ class OpenedLog:
     def messages(self, topic: str, start: float = 0.0, end: float = np.inf) -> Iterator[tuple[float, Message]]:
         """Yield time (s) and message of a topic."""
         first = self._first()
-        for entry, message in Selection((named(topic),), start, end).of(self._reader):
+        for entry, message in Selection((self._named(topic),), start, end).of(self._reader):
             yield (entry.log_time - first) / SECOND, message
         self._warn()
 
@@ -73,7 +75,7 @@ class OpenedLog:
         self, topic: str, columns: Sequence[str] = (), start: float = 0.0, end: float = np.inf
     ) -> Iterator[pa.RecordBatch]:
         """Yield a topic's rows as Arrow batches of a few MB, so that a log of any length needs little memory."""
-        for _, batch in arrow.batches(self._reader, Selection((named(topic),), start, end), columns):
+        for _, batch in arrow.batches(self._reader, Selection((self._named(topic),), start, end), columns):
             yield batch
         self._warn()
 
@@ -84,7 +86,7 @@ class OpenedLog:
             NotFoundError: no such topic or column.
             InputError: a message is invalid.
         """
-        return self._table(named(topic), columns, start, end)
+        return self._table(self._named(topic), columns, start, end)
 
     def numpy(
         self, topic: str, columns: Sequence[str] = (), start: float = 0.0, end: float = np.inf
@@ -166,11 +168,11 @@ class OpenedLog:
         at = topics[0] if at is None and topics else at
         if at is None or at not in topics:
             raise InputError(f"at {at!r}: expected one of the topics of the table ({', '.join(topics) or 'none'})")
-        known = {topic: arrow.schema_of(named(topic)).names for topic in topics}
+        known = {topic: arrow.schema_of(self._named(topic)).names for topic in topics}
         for column in columns:
             if not any(column in names for names in known.values()):
                 raise NotFoundError(f"no column {column} in {', '.join(topics)}")
-        wanted = {named(topic): _wanted(names, columns) for topic, names in known.items()}
+        wanted = {self._named(topic): _wanted(names, columns) for topic, names in known.items()}
         selection, first = Selection(tuple(wanted), times.start, times.end), self._first()
 
         def beside(rows: pa.Table, tables: Mapping[str, pa.Table]) -> pa.Table:
@@ -186,7 +188,7 @@ class OpenedLog:
         kept: dict[str, pa.Table] = {}
         for rows in arrow.windows(self._reader, selection, wanted, seconds):
             tables = {
-                topic: pa.concat_tables([kept[topic], rows[named(topic)]]) if kept else rows[named(topic)]
+                topic: pa.concat_tables([kept[topic], rows[self._named(topic)]]) if kept else rows[self._named(topic)]
                 for topic in topics
             }
             ready = _ready(tables, at, seconds)
@@ -234,9 +236,24 @@ class OpenedLog:
             table = table.drop_columns(LOG_TIME)
         return table.add_column(0, TIME, pa.array(time))
 
-    def _warn(self) -> None:
-        if self._reader.fault is not None:
-            warnings.warn(f"{self._reader.path}: {self._reader.fault}; only the intact part was read", stacklevel=3)
+    def _named(self, topic: str) -> str:
+        """A topic's full name.
+
+        Raises:
+            NotFoundError: no topic, or several topics, have it, or its messages are of another program's type.
+        """
+        try:
+            return named(topic)
+        except NotFoundError:
+            row = info(self._reader.path)["topics"].get(topic)
+            if row is None:
+                raise
+        raise NotFoundError(f"{self._reader.path}: {topic} contains {row['schema']}: expected a topic of monstertruckd")
+
+    def _warn(self, fault: str | None = None) -> None:
+        fault = fault or self._reader.fault
+        if fault is not None:
+            warnings.warn(f"{self._reader.path}: {fault}; only the intact part was read", stacklevel=3)
 
 
 def named(topic: str) -> str:

@@ -3,12 +3,13 @@
 import bz2
 import sqlite3
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
 import lz4.frame
 from rosbags.rosbag1 import Reader as Ros1Reader
+from rosbags.rosbag1 import ReaderError
 from rosbags.rosbag2 import Reader as Ros2Reader
 
 from monstertruck_runtime.errors import InputError
@@ -60,7 +61,7 @@ def ros_messages(path: Path, version: int) -> Iterator[RawMessage]:
             for database in sorted(path.glob("*.db3")) if path.is_dir() else [path]:
                 _require_stored(database)
         encoding = "ros1" if version == 1 else "cdr"
-        with Ros1Reader(path) if version == 1 else Ros2Reader(path) as bag:
+        with _indexed(path) if version == 1 else Ros2Reader(path) as bag:
             if isinstance(bag, Ros1Reader):
                 for at, chunk in bag.chunks.items():
                     unpack = BOUNDED.get(chunk.decompressor, chunk.decompressor)
@@ -72,6 +73,27 @@ def ros_messages(path: Path, version: int) -> Iterator[RawMessage]:
             if read:
                 for one, time, data in bag.messages(connections=read):
                     yield RawMessage(one.topic, one.msgtype, encoding, time, bytes(data))
+
+
+@contextmanager
+def _indexed(path: Path) -> Iterator[Ros1Reader]:
+    """Open a bag of ROS 1.
+
+    Raises:
+        InputError: it has no index, because its recording was cut off.
+        ReaderError: it is no bag.
+    """
+    try:
+        bag = Ros1Reader(path)
+        bag.open()
+    except ReaderError as error:
+        if "index" not in str(error):
+            raise
+        raise InputError(f"{path}: expected a bag with an index: {error}: `rosbag reindex {path}` makes one") from error
+    try:
+        yield bag
+    finally:
+        bag.close()
 
 
 def _require_stored(database: Path) -> None:

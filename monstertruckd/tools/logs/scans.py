@@ -119,7 +119,10 @@ def _mcap(path: Path, given: dict[str, Any], topics: tuple[str, ...]) -> ScanLog
     if not topics and (scans := list(_own(reader))):
         return ScanLog("mcap", scans, fault=reader.fault)
     content = content_of(path, mcap_messages(reader.records()))
-    log = scans_of(path, "mcap by others", content, given, topics)
+    try:
+        log = scans_of(path, "mcap by others", content, given, topics)
+    except InputError as error:
+        raise InputError(f"{error}; it {reader.fault}" if reader.fault else str(error)) from error
     return replace(log, fault=reader.fault)
 
 

@@ -12,6 +12,7 @@ import pytest
 from playwright.async_api import Page, expect
 from typer.main import get_command
 
+from monstertruck_runtime.map_files import load_map
 from monstertruck_schemas.body import LensConfig
 from monstertruck_schemas.event import Cause, Stop
 from monstertruck_schemas.reasons import Reason
@@ -217,6 +218,30 @@ async def parts_of_the_map_outlive_the_whole_map_that_they_belong_to(page: Page)
         grid,
     )
     assert kept == [2, 4]
+
+
+async def the_map_is_saved_as_the_files_of_map_server(page: Page, folder: Path) -> None:
+    cells = bytes([0, 100, 255, 50, 0, 100])
+    await page.route("**/robots/truck/map/*", lambda route: route.fulfill(body=cells))
+    grid = {"width": 3, "height": 2, "resolution": 0.5, "origin": [-1, 2, 0], "frame": "map"}
+    await page.click("#tab-tasks")
+    await expect(page.locator("#task-map")).to_be_hidden()
+    await say(page, {"kind": "map", "version": 7, **grid})
+    await page.wait_for_selector("#map[data-drawn=true]")
+    for part in ("image", "text"):
+        async with page.expect_download() as download:
+            await page.click(f"#map-{part}")
+        await (await download.value).save_as(folder / (await download.value).suggested_filename)
+    world = load_map(folder / "map.yaml")
+    assert (world.resolution, world.origin) == (0.5, (-1.0, 2.0))
+    assert world.cells.tolist() == [[0, 100, -1], [-1, 0, 100]]
+    tiles = """async (grid) => {
+        const { mapImage } = await import("/page/mapfile.js");
+        const tile = { ...grid, width: 2, height: 2, origin: [0, 2.5, 0], cells: [100, 0, 0, 0] };
+        return [...mapImage({ ...grid, cells: new Int8Array(6) }, [tile])].slice(-6);
+    }"""
+    assert await page.evaluate(tiles, grid) == [254, 254, 0, 254, 254, 254], "a tile is cut at the edge of its map"
+    await page.click("#tab-drive")
 
 
 async def a_zone_is_drawn_on_the_map_and_turned_off(page: Page) -> None:
@@ -561,6 +586,13 @@ async def a_goal_says_what_the_gate_lets_it_do(page: Page) -> None:
     await say(page, {"kind": "goal", "m": ended})
     await expect(page.locator("#goal-text")).to_have_text("Goal 3 was ended by an emergency stop")
     await say(page, {"kind": "goal", "m": goal | {"number": 0, "phase": "idle", "goal": None}})
+    await page.click("#tool-goal")
+    await page.mouse.click(*await page.evaluate(PLACE, [0.5, 0.5]))
+    await expect(page.locator("#goal-go")).to_be_enabled()
+    await say(page, gate_says(GateMode.ESTOPPED))
+    await expect(page.locator("#goal-go")).to_be_disabled()
+    await page.click("#goal-drop")
+    await say(page, gate_says(GateMode.DRIVING))
 
 
 async def armed_at_rest_is_called_armed(page: Page) -> None:
@@ -637,8 +669,16 @@ async def why_the_robot_stands_is_in_the_panel_with_time_and_remedy(page: Page) 
     header = {"stamp": 0, "text": "", "received": 10**9, "seq": 1, "number": 4}
     stop = Stop(**header, reason=cause.reason, mode=GateMode.DISARMED, causes=(cause,))
     await say(page, gate_says(GateMode.DISARMED), {"kind": "stop", "m": json.loads(stop.model_dump_json())})
-    expected = "1 s ago: no fresh lidar scan (lidar). Check the lidar's cable and supply"
+    expected = "1 s ago: no fresh lidar scan. Check the lidar's cable and supply"
     await expect(page.locator("#stopped")).to_contain_text(expected)
+    for source, text in (("ann", "emergency stop by ann. Find out"), ("me.1", "you pressed emergency stop. Reset")):
+        cause = Cause(reason=Reason.ESTOP_REQUESTED, source=source, since=10**9, text=f"emergency stop by {source}")
+        stop = Stop(**header, reason=cause.reason, mode=GateMode.ESTOPPED, causes=(cause,))
+        await say(page, {"kind": "pilot", "source": "me.1"}, {"kind": "stop", "m": json.loads(stop.model_dump_json())})
+        await say(page, gate_says(GateMode.ESTOPPED))
+        await expect(page.locator("#stopped")).to_contain_text(f"s ago: {text}")
+    await say(page, gate_says(GateMode.DISARMED))
+    await expect(page.locator("#stopped")).to_have_text(re.compile("s ago: you pressed emergency stop.$"))
     await say(page, gate_says(GateMode.DRIVING, twist={"vx": 0.1, "vy": 0.0, "wz": 0.0}))
     await page.wait_for_selector("#stopped", state="hidden")
 
@@ -743,6 +783,12 @@ async def stick_and_map_are_in_view_together_on_a_phone_and_tabs_stay_in_one_lin
         tops = "all => new Set(all.filter(tab => tab.offsetParent).map(tab => tab.getBoundingClientRect().top)).size"
         assert await page.locator("[role=tab]").evaluate_all(tops) == 1, "one line, all read at one moment"
         assert await page.evaluate("document.documentElement.scrollWidth") <= width
+    await page.set_viewport_size({"width": 390, "height": 700})
+    boxes = await page.evaluate("""() => {
+        document.querySelector("#tab-truck").click();
+        return ["#pane-truck", "#estop"].map((id) => document.querySelector(id).getBoundingClientRect());
+    }""")
+    assert boxes[0]["bottom"] <= boxes[1]["top"], "a press on a tab brings its pane into view"
     await page.set_viewport_size({"width": 1280, "height": 720})
 
 
@@ -1085,6 +1131,7 @@ async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path:
         await an_unknown_way_is_taken_to_be_slow(page)
         await parts_of_the_map_outlive_the_whole_map_that_they_belong_to(page)
         await a_robot_without_a_map_is_called_so(page)
+        await the_map_is_saved_as_the_files_of_map_server(page, tmp_path)
         await a_zone_is_drawn_on_the_map_and_turned_off(page)
         await places_are_marked_moved_renamed_driven_to_and_removed_on_the_map(page)
         await a_mission_is_drawn_on_the_map_run_and_watched(page)

@@ -203,6 +203,20 @@ def test_folders_and_topics_of_logs_that_have_none_are_refused(tmp_path: Path):
         read_scans(write_ros2(tmp_path / "bag", rows))
 
 
+def test_a_log_cut_off_before_its_first_scan_says_so(tmp_path: Path):
+    file = write_foxglove(tmp_path / "a.mcap")
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    with pytest.raises(InputError, match=r"no scans: expected a topic of .*; it is damaged at byte"):
+        read_scans(file)
+
+
+def test_a_bag_that_was_cut_off_names_the_remedy(tmp_path: Path):
+    whole = write_ros1(tmp_path / "a.bag", drive(RosMessages(ROS1))).read_bytes()
+    (tmp_path / "cut.bag").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match=r"cut\.bag: expected a bag with an index: .*: `rosbag reindex .*cut\.bag`"):
+        read_scans(tmp_path / "cut.bag")
+
+
 @pytest.mark.parametrize("packing", ["bz2", "lz4"])
 def test_a_chunk_of_ros_1_is_bounded_before_it_is_unpacked(tmp_path: Path, packing: str):
     ros, file = RosMessages(ROS1), tmp_path / "a.bag"

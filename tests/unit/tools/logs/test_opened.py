@@ -5,6 +5,7 @@ import json
 import math
 import sys
 import warnings
+from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -29,6 +30,8 @@ from monstertruckd.tools.logs.messages import Selection
 from monstertruckd.tools.logs.pose_files import export_kitti, export_tum
 from tests.unit.recorder.conftest import scan
 from tests.unit.tools.logs.log_kit import MAY_2026, Writer, clock, odometry
+
+DATA = Path(__file__).resolve().parents[3] / "data"
 
 
 def jpeg(grey):
@@ -186,8 +189,19 @@ def test_damage_is_a_warning_and_what_is_whole_is_read(file, tmp_path):
     cut.write_bytes(file.read_bytes()[: int(file.stat().st_size * 0.8)])
     with pytest.warns(UserWarning, match=r"cut\.mcap: .*only the intact part was read"):
         assert len(monstertruckd.open_log(cut).pandas("scan")) > 0
+    with pytest.warns(UserWarning, match=r"cut\.mcap: .*only the intact part was read"):
+        assert monstertruckd.open_log(cut).topics()
     with warnings.catch_warnings(action="error"):
         monstertruckd.open_log(file).pandas("scan")
+
+
+def test_a_topic_of_another_program_is_named():
+    log = monstertruckd.open_log(DATA / "foxglove_scans.mcap")
+    assert log.topics() == {"/scan": 50}
+    with pytest.raises(
+        NotFoundError, match=r"foxglove_scans\.mcap: /scan contains foxglove\.LaserScan: expected a topic"
+    ):
+        log.numpy("/scan")
 
 
 def test_every_topic_has_columns_without_json():
