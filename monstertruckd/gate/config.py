@@ -124,8 +124,8 @@ class ObstacleLimits(Schema):
     """Distance travelled before points of earlier scans are forgotten, m; these points guard the truck outside the
     lidar's field of view."""
     memory_deviation: Annotated[float, Field(gt=0, le=0.5)] = 0.1
-    """Growth of the odometry's standard deviation above which earlier scans are ignored, m: their positions are that
-    much less certain."""
+    """Standard deviation, by odometry, of an earlier scan's position relative to the robot above which the scan is
+    ignored, m."""
     open_ground: bool = False
     """Whether a scan without any range means free ground; otherwise it is invalid."""
 

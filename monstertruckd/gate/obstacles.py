@@ -424,7 +424,7 @@ class ObstacleCheck(Check):
                 self.guard.memory.rest(None if view.mode.active else seen)
             self.guard.observe(seen, lidar)
         elif isinstance(seen, Odometry) and topic is ODOMETRY:
-            self.guard.memory.doubt(seen.pose_covariance)
+            self.guard.memory.doubt((seen.pose.x, seen.pose.y), seen.pose_covariance)
         elif isinstance(seen, SonarRanges):
             self.guard.hear(seen)
 

@@ -14,7 +14,6 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Pose2, Twist2, integrate, placed, points_relative
 from monstertruck_planners.collision import Footprint, beyond, on_body, relative
 from monstertruck_runtime.clock import SECOND
-from monstertruck_schemas.base import position_deviation
 from monstertruck_schemas.sensor import HIDDEN, NO_ECHO, VALID_BEAM, LaserScan
 
 DRIFT: Final = 0.03
@@ -81,8 +80,8 @@ class _Taken(NamedTuple):
     """Returns near the body, in the frame of the memory, shape (n, 2), m."""
     free: Array
     """Free distance along every beam, m; padded with a 0 before the first and after the last beam."""
-    variance: float
-    """Variance of the pose in odometry when it was taken, m^2."""
+    odometry: Array
+    """Place (m) of the base in odometry when it was taken, and the covariance of that pose, shape (11,)."""
     doubt: float
     """Doubt about the travelled distance when it was taken, m."""
     beside: float = DRIFT
@@ -132,7 +131,7 @@ class ScanMemory:
         mounts: pose of every lidar in base, m, m, rad.
         distance: distance travelled before points are forgotten, m.
         time: age above which scans are forgotten, s.
-        deviation: growth of the pose's standard deviation above which scans are forgotten, m.
+        deviation: standard deviation of a scan's pose relative to the body above which it is forgotten, m.
     """
 
     def __init__(
@@ -143,7 +142,8 @@ class ScanMemory:
         self._distance = distance
         self._time = round(time * SECOND)
         self._variance_kept = deviation**2
-        self._variance = self._travel_doubt = 0.0
+        self._travel_doubt = 0.0
+        self._odometry: Array = np.zeros(11)
         self._rested: LaserScan | None = None
         """First scan since the robot was disarmed or carried; None while it is armed."""
         self.forget()
@@ -178,12 +178,14 @@ class ScanMemory:
             self._travelled += self._footprint.corner_speed(twist) * dt
         self._ticks.append((now, self._pose, self._travelled))
 
-    def doubt(self, covariance: Array) -> None:
-        """Take the covariance of the pose in odometry, row-major of (x, y, yaw), shape (9,), m^2, m rad, rad^2."""
-        # Lever arm of a heading error that displaces remembered ground, m: the length of a truck plus its stopping
-        # distance.
-        lever = 1.0
-        self._variance = position_deviation(covariance) ** 2 + lever**2 * float(covariance[8])
+    def doubt(self, place: tuple[float, float], covariance: Array) -> None:
+        """Take the pose of the base in odometry.
+
+        Args:
+            place: x, y, m.
+            covariance: covariance of (x, y, yaw), row-major, shape (9,), m^2, m rad, rad^2.
+        """
+        self._odometry = np.concatenate((place, covariance))
 
     def rest(self, scan: LaserScan | None) -> None:
         """Process a scan of a robot at rest; discard the memory if the robot was carried.
@@ -258,7 +260,7 @@ class ScanMemory:
         there = _lifted(points, pose)
         (sensor,) = placed(np.array([mount]), pose).tolist()
         return _Taken(
-            beams, pose, tuple(sensor), travelled, there, np.pad(beams.free, 1), self._variance, self._travel_doubt
+            beams, pose, tuple(sensor), travelled, there, np.pad(beams.free, 1), self._odometry, self._travel_doubt
         )
 
     def points(self) -> Array:
@@ -304,12 +306,9 @@ class ScanMemory:
         return [*sorted(self._fresh(views, newest), key=lambda view: view.beams.stamp), *latest]
 
     def _fresh(self, kept: Iterable[_Taken], newest: _Taken) -> list[_Taken]:
-        return [
-            taken
-            for taken in kept
-            if newest.beams.stamp - taken.beams.stamp < self._time
-            and newest.variance - taken.variance < self._variance_kept
-        ]
+        recent = [taken for taken in kept if newest.beams.stamp - taken.beams.stamp < self._time]
+        near = _gained(recent, newest) < self._variance_kept
+        return [taken for taken, fresh in zip(recent, near, strict=True) if fresh]
 
     def seen(self, points: Array) -> NDArray[np.bool_]:
         """Return whether each point (n, 2), in base at the latest scan (m), was seen free or is under the body."""
@@ -342,8 +341,7 @@ class ScanMemory:
         free = np.concatenate([scan.free for scan in taken])[np.clip(starts + 1 + beams, starts, ends - 1)]
         beyond_x, beyond_y = beyond(self._footprint, np.array([scan.pose for scan in taken]), there)
         newest = taken[0] if self._newest is None else self._newest
-        gained = np.array([max(newest.variance - scan.variance, 0.0) for scan in taken])
-        unsure = np.sqrt(gained)[:, None]
+        unsure = np.sqrt(_gained(taken, newest))[:, None]
         beside = np.array([scan.beside for scan in taken])[:, None]
         known = np.maximum(beyond_x, beyond_y) < beside - np.maximum(unsure - self._footprint.padding, 0.0)
         return np.asarray((free > distances + unsure) | known)
@@ -386,6 +384,25 @@ def spaced(points: Array, spacing: float) -> Array:
 def _lifted(points: Array, pose: Pose2) -> Array:
     """Points (n, 2) relative to ``pose`` as points of the frame that the pose is in."""
     return placed(np.column_stack((points, np.zeros(len(points)))), pose)[:, :2]
+
+
+def _gained(taken: Sequence[_Taken], newest: _Taken) -> Array:
+    """Variance of ground remembered from each of n poses, relative to the body at the newest one, shape (n,), m^2.
+
+    An error of the heading from before a pose was taken turns that pose and the way from it alike: the ground stays in
+    its place relative to the body.
+    """
+    before = np.array([scan.odometry for scan in taken]).reshape(-1, 11)
+    dx, dy = (newest.odometry[:2] - before[:, :2]).T
+    xx, xy, xw, _, yy, yw, _, _, ww = before[:, 2:].T
+    ahead, aside = xw - dy * ww, yw + dx * ww
+    carried = np.array((xx - dy * (xw + ahead), xy + dx * xw - dy * aside, yy + dx * (yw + aside), ww))
+    xx, xy, yy, ww = newest.odometry[[2, 3, 6, 10], None] - carried
+    largest = (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)
+    # Lever arm of a heading error that displaces remembered ground, m: the length of a truck plus its stopping
+    # distance.
+    lever = 1.0
+    return np.asarray(np.maximum(largest, 0.0) + lever**2 * np.maximum(ww, 0.0))
 
 
 def _keep(views: deque[_Taken], taken: _Taken) -> None:

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+from monstertruck_estimation.odometry import PlanarCovariance
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint, ScanPoints, first_contact, swept_poses
 from monstertruck_runtime.clock import SECOND
@@ -760,7 +761,7 @@ def test_ground_seen_from_a_place_less_certain_counts_less_and_at_last_not_at_al
     now = drive(remembered, 0.4)
 
     def grown(deviation):
-        remembered.doubt(np.array([deviation**2, 0, 0, 0, 0.0, 0, 0, 0, 0.0]))
+        remembered.doubt((0.0, 0.0), np.array([deviation**2, 0, 0, 0, 0.0, 0, 0, 0, 0.0]))
         see(remembered, now)
 
     edge = -BACK - 0.4 - DRIFT
@@ -779,9 +780,23 @@ def test_an_error_of_the_heading_counts_at_the_length_of_a_truck():
     remembered = ScanMemory(FOOTPRINT, [MOUNT], 2.0, 30.0, 0.05)
     see(remembered, SECOND)
     now = drive(remembered, 0.4)
-    remembered.doubt(np.array([0.0] * 8 + [0.06**2]))
+    remembered.doubt((0.0, 0.0), np.array([0.0] * 8 + [0.06**2]))
     see(remembered, now)
     assert not seen(remembered, -BACK - 0.3)
+
+
+@pytest.mark.parametrize("heading", [0.0, 2.0])
+@pytest.mark.parametrize(("gained", "known"), [(0.0, True), (0.04, True), (0.06, False)])
+def test_an_error_of_the_heading_from_before_a_scan_moves_no_ground_that_it_saw(heading, gained, known):
+    remembered = ScanMemory(FOOTPRINT, [MOUNT], 2.0, 30.0, 0.05)
+    lost = PlanarCovariance(xx=1.0, xy=0.2, yy=2.0, xw=0.3, yw=-0.1, ww=0.5)  # a long way without a compass
+    remembered.doubt((7.0, -3.0), lost.matrix().ravel())
+    see(remembered, SECOND)
+    now = drive(remembered, 0.4)
+    dx, dy = 0.4 * math.cos(heading), 0.4 * math.sin(heading)
+    remembered.doubt((7.0 + dx, -3.0 + dy), lost.moved(dx, dy).plus((0, 0, 0, 0, 0, gained**2)).matrix().ravel())
+    see(remembered, now)
+    assert seen(remembered, -BACK - 0.3) is known
 
 
 def test_what_a_truck_that_stands_sees_does_not_age():
