@@ -5,6 +5,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from monstertruck_drivers.shafts import MotorLimits
 from monstertruck_schemas.base import Schema
 
 Microseconds = Annotated[float, Field(gt=0, le=4000)]
@@ -77,6 +78,11 @@ class EscPulses(Schema):
         """Pulse (us) for a rate (rad/s), forward positive, clamped to the limits."""
         share = min(max(rate / self.max_rate, -1.0), 1.0)
         return self.neutral_us + self.direction * self.reach_us * share
+
+    @property
+    def motor_limits(self) -> MotorLimits:
+        """Limits of the motor."""
+        return MotorLimits(self.max_rate, self.deceleration, self.quick_deceleration)
 
     def rate(self, pulse_us: float) -> float:
         """Rate commanded by a pulse (rad/s), forward positive."""

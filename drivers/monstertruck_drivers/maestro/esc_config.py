@@ -32,7 +32,7 @@ class MaestroEscConfig(Schema):
     @property
     def motor_limits(self) -> MotorLimits:
         """Limits of the motor."""
-        return MotorLimits(self.esc.max_rate, self.esc.deceleration, self.esc.quick_deceleration)
+        return self.esc.motor_limits
 
     @property
     def steering_outputs(self) -> SteeringOutputs:

@@ -6,15 +6,18 @@ must send this channel to the neutral pulse. The motor is not measured: the repo
 as configured.
 """
 
+from typing import Unpack
+
 from monstertruck_drivers.esc import UnmeasuredMotor
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.maestro.driver import MaestroDriver
 from monstertruck_drivers.maestro.esc_config import MaestroEscConfig
 from monstertruck_drivers.maestro.session import MaestroSession
+from monstertruck_drivers.motors import ShaftEnds
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
-from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
+from monstertruck_schemas.cmd import SteeringCommand
 from monstertruck_schemas.sensor import Battery, DriveFeedback, SteeringFeedback
 
 
@@ -25,20 +28,13 @@ class MaestroEscDriver(MaestroDriver):
         config: speed controller and unit.
         port: the Maestro's Command Port.
         clock: time.
-        commands: ``cmd/drive``.
-        commands_2: not used; there is one motor.
-        commands_3: not used.
-        commands_4: not used.
         steering_commands: ``cmd/steering``.
         drive: this driver's own feedback; it has no current.
-        out: ``sensor/drive``: the rate commanded.
-        out_2: not used.
-        out_3: not used.
-        out_4: not used.
         steering: pulses being sent, as servo angles.
         battery: pack voltage; None if another device measures the battery.
         events: errors of the device.
         name: name of the service.
+        ends: topics of the shafts; there is one motor, whose rate is published as commanded.
     """
 
     def __init__(
@@ -47,26 +43,19 @@ class MaestroEscDriver(MaestroDriver):
         port: Port,
         clock: Clock,
         *,
-        commands: Subscription[DriveCommand],
-        commands_2: Subscription[DriveCommand],
-        commands_3: Subscription[DriveCommand],
-        commands_4: Subscription[DriveCommand],
         steering_commands: Subscription[SteeringCommand],
         drive: Subscription[DriveFeedback],
-        out: Publisher[DriveFeedback],
-        out_2: Publisher[DriveFeedback],
-        out_3: Publisher[DriveFeedback],
-        out_4: Publisher[DriveFeedback],
         steering: Publisher[SteeringFeedback] | None,
         battery: Publisher[Battery] | None,
         events: EventSink,
         name: str = "actuators",
+        **ends: Unpack[ShaftEnds],
     ) -> None:
         if steering is None:
             raise ConfigError(f"devices.{name}: another device steers; kind maestro_esc does it itself")
         super().__init__(config.unit, port, clock, steering_commands, steering, battery, events, name, drive=drive)
         self._esc = config.esc
-        self._motor = UnmeasuredMotor(config.esc, clock, commands, out, config.command_timeout)
+        self._motor = UnmeasuredMotor(config.esc, clock, ends["commands"], ends["out"], config.command_timeout)
 
     async def run(self, ready: Ready) -> None:
         """Serve one session; raises the errors of ``MaestroDriver.run``."""

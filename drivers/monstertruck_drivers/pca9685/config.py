@@ -102,7 +102,7 @@ class Pca9685EscConfig(Schema):
     @property
     def motor_limits(self) -> MotorLimits:
         """Limits of the motor."""
-        return MotorLimits(self.esc.max_rate, self.esc.deceleration, self.esc.quick_deceleration)
+        return self.esc.motor_limits
 
     @property
     def steering_outputs(self) -> SteeringOutputs:

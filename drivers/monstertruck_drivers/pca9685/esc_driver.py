@@ -6,14 +6,17 @@ hangs, it repeats the latest pulse. The motor is not measured: the reported rate
 configured.
 """
 
+from typing import Unpack
+
 from monstertruck_drivers.esc import UnmeasuredMotor
 from monstertruck_drivers.link import Port
+from monstertruck_drivers.motors import ShaftEnds
 from monstertruck_drivers.pca9685.config import Pca9685EscConfig
 from monstertruck_drivers.pca9685.driver import Pca9685Driver
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
-from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
+from monstertruck_schemas.cmd import SteeringCommand
 from monstertruck_schemas.sensor import Battery, DriveFeedback, SteeringFeedback
 
 
@@ -24,20 +27,13 @@ class Pca9685EscDriver(Pca9685Driver):
         config: speed controller and chip.
         port: the I2C bus.
         clock: time.
-        commands: ``cmd/drive``.
-        commands_2: not used; there is one motor.
-        commands_3: not used.
-        commands_4: not used.
         steering_commands: ``cmd/steering``.
         drive: not used.
-        out: ``sensor/drive``: the rate commanded.
-        out_2: not used.
-        out_3: not used.
-        out_4: not used.
         steering: pulses being sent, as servo angles.
         battery: not used.
         events: faults of the chip.
         name: name of the service.
+        ends: topics of the shafts; there is one motor, whose rate is published as commanded.
     """
 
     def __init__(
@@ -46,26 +42,19 @@ class Pca9685EscDriver(Pca9685Driver):
         port: Port,
         clock: Clock,
         *,
-        commands: Subscription[DriveCommand],
-        commands_2: Subscription[DriveCommand],
-        commands_3: Subscription[DriveCommand],
-        commands_4: Subscription[DriveCommand],
         steering_commands: Subscription[SteeringCommand],
         drive: Subscription[DriveFeedback],
-        out: Publisher[DriveFeedback],
-        out_2: Publisher[DriveFeedback],
-        out_3: Publisher[DriveFeedback],
-        out_4: Publisher[DriveFeedback],
         steering: Publisher[SteeringFeedback] | None,
         battery: Publisher[Battery] | None,
         events: EventSink,
         name: str = "actuators",
+        **ends: Unpack[ShaftEnds],
     ) -> None:
         if steering is None:
             raise ConfigError(f"devices.{name}: another device steers; kind pca9685_esc does it itself")
         super().__init__(config.unit, port, clock, steering_commands, steering, battery, events, name, drive=drive)
         self._esc = config.esc
-        self._motor = UnmeasuredMotor(config.esc, clock, commands, out, config.command_timeout)
+        self._motor = UnmeasuredMotor(config.esc, clock, ends["commands"], ends["out"], config.command_timeout)
 
     async def run(self, ready: Ready) -> None:
         """Serve one session; raises the errors of ``Pca9685Driver.run``."""
