@@ -121,7 +121,10 @@ def one_seed(seed: int) -> dict[str, Any]:
         config = robot(hidden(seed), seed, Path(folder))
         drive(
             config,
-            [runs.circle_plan(config, ratio, reference, 3.0), runs.straight_plan(config, 0.682, 12, reference)],
+            [
+                runs.CircleRun(ratio=ratio, reference=reference, laps=3.0).plan(config),
+                runs.StraightRun(reference=reference).plan(config),
+            ],
         )
         (run, circle), (_, line) = analysed(Path(folder))
     assert isinstance(circle, Circle)
@@ -144,8 +147,10 @@ def one_seed(seed: int) -> dict[str, Any]:
 
 def paper_plans(config: SimulatedTruckConfig) -> list[list[runs.Stretch]]:
     """The paper's seven circles and its line."""
-    circles = [runs.circle_plan(config, ratio, w, 3.0) for ratio in RATIOS[:2] for w in REFERENCES]
-    return [*circles, runs.circle_plan(config, math.inf, 1.57, 3.0), runs.straight_plan(config, 0.682, 12, 1.57)]
+    circles = [
+        runs.CircleRun(ratio=ratio, reference=w, laps=3.0).plan(config) for ratio in RATIOS[:2] for w in REFERENCES
+    ]
+    return [*circles, runs.CircleRun(ratio=math.inf, laps=3.0).plan(config), runs.StraightRun().plan(config)]
 
 
 def figures(folder: Path) -> None:

@@ -25,7 +25,7 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_ove
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 from monstertruckd.tools.tune.recipe import WallGains
-from monstertruckd.tools.tune.runs import TuningRun, tune
+from monstertruckd.tools.tune.runs import Tuning, TuningRun, tune
 from wall_parts.arena import Arena, study
 from wall_parts.simulation import mirrored
 
@@ -141,7 +141,7 @@ def tuned(
         async with rig.running():
             operator = LocalOperator(rig.daemon, clock)
             await clock.sleep(SETTLED)
-            found = await tune(operator, "wall_left", 0.3, first, 8.0, lambda: clock.sleep(1.5), keep)
+            found = await tune(operator, "wall_left", 0.3, Tuning(first=first), lambda: clock.sleep(1.5), keep)
             assert not rig.truth.array()[:, 5].any(), "the robot touched the wall"
             return found
 

@@ -51,10 +51,10 @@ def test_a_circle_and_a_line_are_found_in_the_log(tmp_path: Path):
         async with rig.running():
             operator = LocalOperator(rig.daemon, clock)
             await clock.sleep(2.0)
-            await runs.drive(operator, clock, config, runs.circle_plan(config, 3.0, 1.57, 1.5))
+            await runs.drive(operator, clock, config, runs.CircleRun(ratio=3.0, laps=1.5).plan(config))
             rig.world.carry(clock.now(), (-0.2, 0.0, 0.0))
             await clock.sleep(4.0)
-            await runs.drive(operator, clock, config, runs.straight_plan(config, 0.3, 3, 1.57))
+            await runs.drive(operator, clock, config, runs.StraightRun(length=0.3, passes=3).plan(config))
 
     run_virtual(main, start=SECOND)
     (log,) = tmp_path.rglob("*.mcap")
@@ -91,7 +91,7 @@ def test_a_loss_of_the_controller_stops_all_wheels_and_ends_the_run(tmp_path: Pa
 
             task = asyncio.create_task(unplug())
             with pytest.raises(RequestRefusedError, match="stopped during the run"):
-                await runs.drive(operator, clock, config, runs.circle_plan(config, 2.0, 1.57, 2.0))
+                await runs.drive(operator, clock, config, runs.CircleRun(laps=2.0).plan(config))
             await task
             await clock.sleep(0.5)
             assert abs(rig.truth.array()[-1, 4]) < 1e-6

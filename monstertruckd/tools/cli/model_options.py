@@ -103,7 +103,11 @@ def parameter(name: str, kind: Any, declared: Any) -> inspect.Parameter:
 
 
 def field_parameters(
-    model: "type[BaseModel]", *names: str, arguments: bool = False, switches: dict[str, str] | None = None
+    model: "type[BaseModel]",
+    *names: str,
+    arguments: bool = False,
+    defaults: bool = False,
+    switches: dict[str, str] | None = None,
 ) -> Iterator[inspect.Parameter]:
     """Yield an option for each field: its help is the field's docstring, its values are entered as people write them.
 
@@ -113,6 +117,7 @@ def field_parameters(
         model: model of the settings.
         names: fields.
         arguments: make arguments instead of options.
+        defaults: state the model's defaults in the help; otherwise the robot's configuration may set others.
         switches: words of a truth value other than ``--name/--no-name``, by field.
     """
     from monstertruck_schemas.base import field_docs
@@ -125,6 +130,8 @@ def field_parameters(
         if unit is not None and kind is float:
             settings["parser"], settings["metavar"], entered = PARSERS[unit[1]]
             text = text[: unit.start()] + entered + text[unit.end() :]
+        if defaults:
+            text += f"; default: {model.model_fields[name].default}"
         settings |= {"help": text, "show_default": False}
         if arguments:
             yield parameter(name, kind, typer.Argument(**settings))

@@ -9,11 +9,13 @@ from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import InputError
 from monstertruckd.tools.cli.connection import robot_config, with_robot
 from monstertruckd.tools.cli.logs import finish_log
+from monstertruckd.tools.cli.model_options import ModelCommand, field_parameters
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption
 from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, print_table, remark
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    import inspect
+    from collections.abc import Callable, Iterator
 
     from monstertruck_runtime.client import TruckClient
     from monstertruck_runtime.clock import Clock
@@ -24,37 +26,45 @@ if TYPE_CHECKING:
 
 app = command_group("The skid-steer study: circles and straight passes by wheel speeds, open loop, and their analysis.")
 
-Reference = Annotated[float, typer.Option(help="Rate of the faster side's wheels, rad/s.")]
+
+class CircleCommand(ModelCommand):
+    """Command with the numbers of a circle as options."""
+
+    def added(self) -> "Iterator[inspect.Parameter]":
+        """Yield the numbers."""
+        from monstertruckd.tools.study.runs import CircleRun
+
+        return field_parameters(CircleRun, *CircleRun.model_fields, defaults=True)
 
 
-@app.command("circle")
+class StraightCommand(ModelCommand):
+    """Command with the numbers of passes to and fro as options."""
+
+    def added(self) -> "Iterator[inspect.Parameter]":
+        """Yield the numbers."""
+        from monstertruckd.tools.study.runs import StraightRun
+
+        return field_parameters(StraightRun, *StraightRun.model_fields, defaults=True)
+
+
+@app.command("circle", cls=CircleCommand)
 def circle_command(
-    ratio: Annotated[float, typer.Option(help="Ratio of the wheel rates: 2, 3, or inf (left side locked).")] = 2.0,
-    reference: Reference = 1.57,
-    laps: Annotated[float, typer.Option(help="Laps of the ideal robot; a robot that skids turns less.")] = 5.0,
-    robot: RobotOption = "skid_stand",
-    endpoint: EndpointOption = DEFAULT_ENDPOINT,
+    context: typer.Context, robot: RobotOption = "skid_stand", endpoint: EndpointOption = DEFAULT_ENDPOINT
 ) -> None:
     """Arm and drive a circle to the left, open loop; the daemon's log has the run. Takes the role engineer."""
-    from monstertruckd.tools.study.runs import check_circle, circle_plan
+    from monstertruckd.tools.study.runs import CircleRun
 
-    check_circle(ratio, reference, laps)
-    _drive(lambda config: circle_plan(config, ratio, reference, laps), robot, endpoint)
+    _drive(CircleRun.model_validate(context.obj).plan, robot, endpoint)
 
 
-@app.command("straight")
+@app.command("straight", cls=StraightCommand)
 def straight_command(
-    length: Annotated[float, typer.Option(help="Length of a pass, m.")] = 0.682,
-    passes: Annotated[int, typer.Option(help="Number of passes there and back.")] = 12,
-    reference: Reference = 1.57,
-    robot: RobotOption = "skid_stand",
-    endpoint: EndpointOption = DEFAULT_ENDPOINT,
+    context: typer.Context, robot: RobotOption = "skid_stand", endpoint: EndpointOption = DEFAULT_ENDPOINT
 ) -> None:
     """Arm and drive to and fro along a line, open loop; the daemon's log has the run. Takes the role engineer."""
-    from monstertruckd.tools.study.runs import check_straight, straight_plan
+    from monstertruckd.tools.study.runs import StraightRun
 
-    check_straight(length, passes, reference)
-    _drive(lambda config: straight_plan(config, length, passes, reference), robot, endpoint)
+    _drive(StraightRun.model_validate(context.obj).plan, robot, endpoint)
 
 
 @app.command("analyse")

@@ -9,10 +9,14 @@ from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.extras import needs_extra
 from monstertruckd.tools.cli.connection import require_section, with_robot
+from monstertruckd.tools.cli.model_options import ModelCommand, field_parameters
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption
 from monstertruckd.tools.cli.output import command_group, print_table, remark
 
 if TYPE_CHECKING:
+    import inspect
+    from collections.abc import Iterator
+
     from monstertruck_runtime.client import TruckClient
     from monstertruck_runtime.clock import Clock
     from monstertruckd.tools.tune.recipe import WallGains
@@ -21,11 +25,20 @@ if TYPE_CHECKING:
 app = command_group("Find controller gains with test runs of the robot.")
 
 
-@app.command("wall")
+class WallCommand(ModelCommand):
+    """Command with the settings of the runs as options."""
+
+    def added(self) -> "Iterator[inspect.Parameter]":
+        """Yield the settings."""
+        from monstertruckd.tools.tune.runs import Tuning
+
+        return field_parameters(Tuning, *Tuning.model_fields, defaults=True)
+
+
+@app.command("wall", cls=WallCommand)
 def wall_command(
+    context: typer.Context,
     name: Annotated[str, typer.Argument(help="A behaviour of kind wall_pd.")] = "wall_left",
-    first: Annotated[float, typer.Option(min=0.1, max=100, help="K_p of the first run.")] = 6.0,
-    seconds: Annotated[float, typer.Option(min=4, max=60, help="Seconds of following in each run.")] = 8.0,
     plot: Annotated[
         Path | None, typer.Option("--plot", help="PNG file with the figure of all runs.", show_default=False)
     ] = None,
@@ -33,8 +46,9 @@ def wall_command(
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
 ) -> None:
     """Arm the robot, which stands next to a wall, and raise K_p and K_d by the coursework's recipe, run by run."""
-    from monstertruckd.tools.tune.runs import tune
+    from monstertruckd.tools.tune.runs import Tuning, tune
 
+    tuning = Tuning.model_validate(context.obj)
     if plot is not None:
         with needs_extra("plot"):
             from monstertruckd.tools.figures import require_drawable
@@ -52,7 +66,7 @@ def wall_command(
             raise NotFoundError(f"no behaviour {name!r}: see `monstertruckd behave list`")
         if config["kind"] != "wall_pd":
             raise InputError(f"{name} is of kind {config['kind']}: expected wall_pd, which has these gains")
-        return await tune(client, name, float(config["distance"]), first, seconds, lambda: clock.sleep(1.5), report)
+        return await tune(client, name, float(config["distance"]), tuning, lambda: clock.sleep(1.5), report)
 
     try:
         best = with_robot(main, robot, endpoint)

@@ -3,7 +3,9 @@
 import math
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Final, NamedTuple
+from typing import Annotated, Final, NamedTuple
+
+from pydantic import Field
 
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError, NoAnswerError, RequestRefusedError, TruckError
@@ -11,12 +13,16 @@ from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.presence import GONE
 from monstertruck_runtime.requests import Operator
 from monstertruck_schemas import topics
+from monstertruck_schemas.base import Schema
 from monstertruckd.config.truck import TruckConfig
 
 REVERSAL_PAUSE: Final = 0.6
 """Seconds of standstill at a reversal."""
 SETTLING: Final = 2.0
 """Seconds at the beginning of a run that the analysis leaves out; they are driven besides."""
+
+
+Positive = Annotated[float, Field(gt=0)]
 
 
 class Stretch(NamedTuple):
@@ -28,63 +34,41 @@ class Stretch(NamedTuple):
     seconds: float
 
 
-def circle_plan(config: TruckConfig, ratio: float, reference: float, laps: float) -> list[Stretch]:
-    """A circle to the left: the right side at the reference rate, the left one slower by the ratio.
+class CircleRun(Schema):
+    """A circle to the left: the right side at the reference rate, the left one slower by the ratio."""
 
-    Args:
-        config: configuration of the robot, with its geometry.
-        ratio: ratio of the sides' rates, above 1; inf = the left side is locked.
-        reference: rate of the faster side, rad/s.
-        laps: laps of the ideal robot; one that skids turns less.
+    ratio: Annotated[float, Field(gt=1, allow_inf_nan=True)] = 2.0
+    """Ratio of the wheel rates: 2, 3, or inf (left side locked)"""
+    reference: Positive = 1.57
+    """Rate of the faster side's wheels, rad/s"""
+    laps: Positive = 5.0
+    """Laps of the ideal robot; a robot that skids turns less"""
 
-    Raises:
-        InputError: numbers that make no circle.
-    """
-    check_circle(ratio, reference, laps)
-    left = 0.0 if math.isinf(ratio) else reference / ratio
-    rate = config.geometry.wheel_radius * (reference - left) / config.geometry.track
-    return [Stretch(left, reference, SETTLING + laps * math.tau / rate)]
-
-
-def straight_plan(config: TruckConfig, length: float, passes: int, reference: float) -> list[Stretch]:
-    """Passes to and fro, each as long as the ideal robot needs.
-
-    Args:
-        config: configuration of the robot.
-        length: length of a pass, m.
-        passes: how many.
-        reference: rate of all wheels, rad/s.
-
-    Raises:
-        InputError: numbers that make no line.
-    """
-    check_straight(length, passes, reference)
-    seconds = length / (config.geometry.wheel_radius * reference)
-    plan: list[Stretch] = []
-    for i in range(passes):
-        sign = -1.0 if i % 2 else 1.0
-        plan += [Stretch(sign * reference, sign * reference, seconds), Stretch(0.0, 0.0, REVERSAL_PAUSE)]
-    return plan
+    def plan(self, config: TruckConfig) -> list[Stretch]:
+        """Wheel rates of the run for a robot of this geometry."""
+        left = 0.0 if math.isinf(self.ratio) else self.reference / self.ratio
+        rate = config.geometry.wheel_radius * (self.reference - left) / config.geometry.track
+        return [Stretch(left, self.reference, SETTLING + self.laps * math.tau / rate)]
 
 
-def check_circle(ratio: float, reference: float, laps: float) -> None:
-    """Refuse numbers that make no circle, of any robot; arguments and error as ``circle_plan``'s."""
-    if not ratio > 1.0:
-        raise InputError(f"ratio {ratio:g}: expected more than 1 (2, 3, inf)")
-    _require(reference, laps, "laps")
+class StraightRun(Schema):
+    """Passes to and fro, each as long as the ideal robot needs."""
 
+    length: Positive = 0.682
+    """Length of a pass, m"""
+    passes: Annotated[int, Field(ge=1)] = 12
+    """Number of passes there and back"""
+    reference: Positive = 1.57
+    """Rate of all wheels, rad/s"""
 
-def check_straight(length: float, passes: int, reference: float) -> None:
-    """Refuse numbers that make no line, of any robot; arguments and error as ``straight_plan``'s."""
-    _require(reference, length, "length")
-    if passes < 1:
-        raise InputError(f"passes {passes}: expected at least 1")
-
-
-def _require(reference: float, size: float, name: str) -> None:
-    for word, value in (("reference", reference), (name, size)):
-        if not 0.0 < value < math.inf:
-            raise InputError(f"{word} {value:g}: expected a number above 0")
+    def plan(self, config: TruckConfig) -> list[Stretch]:
+        """Wheel rates of the run for a robot of this geometry."""
+        seconds = self.length / (config.geometry.wheel_radius * self.reference)
+        plan: list[Stretch] = []
+        for i in range(self.passes):
+            rate = -self.reference if i % 2 else self.reference
+            plan += [Stretch(rate, rate, seconds), Stretch(0.0, 0.0, REVERSAL_PAUSE)]
+        return plan
 
 
 def shaft_rates(config: TruckConfig, stretch: Stretch) -> tuple[float, ...]:

@@ -5,13 +5,16 @@ from collections.abc import Awaitable, Callable, Generator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
+
+from pydantic import Field
 
 from monstertruck_runtime.drives import taken_back
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import Mailbox, fifo
 from monstertruck_runtime.presence import while_it_runs
 from monstertruck_runtime.requests import Operator
+from monstertruck_schemas.base import Schema
 from monstertruck_schemas.plan import BehaviourState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder
@@ -27,6 +30,15 @@ LOST: Final = 0.12
 
 Samples = Sequence[tuple[float, float]]
 """Times since following began, s, and measured distances, m."""
+
+
+class Tuning(Schema):
+    """Runs by which the gains are found."""
+
+    first: Annotated[float, Field(ge=0.1, le=100)] = 6.0
+    """K_p of the first run"""
+    seconds: Annotated[float, Field(ge=4, le=60)] = 8.0
+    """Time of following in each run, s"""
 
 
 class TuningRun(NamedTuple):
@@ -50,8 +62,7 @@ async def tune(
     client: Operator,
     name: str,
     distance: float,
-    first: float,
-    seconds: float,
+    tuning: Tuning,
     pause: Callable[[], Awaitable[None]],
     report: Callable[[TuningRun], None],
 ) -> WallGains | None:
@@ -63,8 +74,7 @@ async def tune(
         client: client of the robot.
         name: name of a behaviour of kind ``wall_pd``.
         distance: the nearer one, m; every second run wants 5 cm more.
-        first: K_p of the first run.
-        seconds: seconds of following that make a run.
+        tuning: first gain and length of the runs.
         pause: waits until the robot stands.
         report: called with every run.
 
@@ -76,7 +86,7 @@ async def tune(
     async with taken_back(client.disarm):
         await client.arm(hold=True)  # until the behaviour runs: a path that the robot has would be driven
     try:
-        return await _tuned(client, name, distance, recipe(first), seconds, pause, report)
+        return await _tuned(client, name, distance, recipe(tuning.first), tuning.seconds, pause, report)
     finally:
         with suppress(TruckError):
             await client.disarm()

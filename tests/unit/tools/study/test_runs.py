@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from pydantic import ValidationError
 
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import InputError, TruckError
@@ -14,7 +15,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruckd.tools.simulation.config import load_simulated
 from monstertruckd.tools.study import published
-from monstertruckd.tools.study.runs import Stretch, circle_plan, drive, shaft_rates, straight_plan
+from monstertruckd.tools.study.runs import CircleRun, StraightRun, Stretch, drive, shaft_rates
 from tests.bus_kit import gate_state
 
 CONFIGS = Path(__file__).resolve().parents[4] / "configs"
@@ -22,15 +23,15 @@ STAND = load_simulated(CONFIGS / "robots" / "skid_stand.yaml")
 
 
 def test_a_circle_has_the_faster_side_at_the_reference():
-    (stretch,) = circle_plan(STAND, 2.0, 1.57, 5.0)
+    (stretch,) = CircleRun(ratio=2.0, reference=1.57, laps=5.0).plan(STAND)
     assert (stretch.left, stretch.right) == (0.785, 1.57)
     assert stretch.seconds == pytest.approx(2.0 + 5 * math.tau / (0.021 * 0.785 / 0.105))
     assert shaft_rates(STAND, stretch) == (0.785, 1.57, 0.785, 1.57)
-    assert circle_plan(STAND, math.inf, 1.57, 1.0)[0].left == 0.0
+    assert CircleRun(ratio=math.inf, laps=1.0).plan(STAND)[0].left == 0.0
 
 
 def test_a_line_goes_to_and_fro():
-    plan = straight_plan(STAND, 0.682, 3, 1.57)
+    plan = StraightRun(length=0.682, passes=3, reference=1.57).plan(STAND)
     assert [stretch.left for stretch in plan] == [1.57, 0.0, -1.57, 0.0, 1.57, 0.0]
     assert plan[0].seconds == pytest.approx(0.682 / (0.021 * 1.57))
 
@@ -89,20 +90,20 @@ def test_a_robot_that_stops_or_vanishes_ends_the_run_whenever_its_computer_was_s
 
 @pytest.mark.parametrize("numbers", [(1.0, 1.57, 1.0), (math.nan, 1.0, 1.0), (2.0, 0.0, 1.0), (2.0, 1.0, math.inf)])
 def test_numbers_that_make_no_circle(numbers):
-    with pytest.raises(InputError, match="expected"):
-        circle_plan(STAND, *numbers)
+    with pytest.raises(ValidationError):
+        CircleRun(**dict(zip(("ratio", "reference", "laps"), numbers, strict=True)))
 
 
 @pytest.mark.parametrize("numbers", [(0.0, 1, 1.0), (1.0, 0, 1.0), (1.0, 1, -1.0)])
 def test_numbers_that_make_no_line(numbers):
-    with pytest.raises(InputError, match="expected"):
-        straight_plan(STAND, *numbers)
+    with pytest.raises(ValidationError):
+        StraightRun(**dict(zip(("length", "passes", "reference"), numbers, strict=True)))
 
 
 def test_a_truck_has_no_sides():
     truck = load_simulated(CONFIGS / "demo.yaml")
     with pytest.raises(InputError, match="expected one with a left and a right side"):
-        shaft_rates(truck, circle_plan(STAND, 2.0, 1.0, 1.0)[0])
+        shaft_rates(truck, CircleRun().plan(STAND)[0])
 
 
 def test_the_paper_contradicts_itself_where_we_say_so():

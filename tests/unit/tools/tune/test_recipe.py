@@ -20,7 +20,7 @@ from monstertruck_schemas.req import BehaviourOrder
 from monstertruck_schemas.topics import BEHAVIOUR, GATE
 from monstertruckd.tools.cli.main import app
 from monstertruckd.tools.tune.recipe import RunVerdict, judged, recipe
-from monstertruckd.tools.tune.runs import draw, tune
+from monstertruckd.tools.tune.runs import Tuning, draw, tune
 from tests.bus_kit import gate_state
 from tests.unit.planners.behave.wall_kit import Robot, drive
 
@@ -84,7 +84,7 @@ async def rest():
 
 
 def tuned(client, runs):
-    return asyncio.run(tune(client, "wall_left", 0.3, 3.0, 8.0, rest, runs.append))
+    return asyncio.run(tune(client, "wall_left", 0.3, Tuning(first=3.0), rest, runs.append))
 
 
 def test_it_raises_p_until_it_overshoots_and_d_until_it_is_calm(tmp_path):
