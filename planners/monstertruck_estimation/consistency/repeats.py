@@ -11,6 +11,7 @@ from typing import Final
 
 import numpy as np
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
 
 NOISE_READINGS: Final = 20
@@ -108,11 +109,30 @@ class WholeRepeats:
 def scan_content(scan: LaserScan) -> bytes | None:
     """Return what a scan repeats if its lidar does, for ``WholeRepeats``; None if it has too few ranges.
 
-    Hardly any scan has fewer different ranges than it needs at all. A lidar with one that has repeats a packet, cut
-    differently in each revolution: its content is the set of its ranges.
+    The content of a scan that repeats a packet of 2 to 19 beams (LD19: 12) is the set of its ranges, as revolutions cut
+    such packets differently. The content of any other scan is its ranges in order.
     """
-    ranges, fewest = scan.ranges[scan.codes == VALID_BEAM], 20
-    if len(ranges) < fewest:
+    valid, fewest = scan.codes == VALID_BEAM, 20
+    if np.count_nonzero(valid) < fewest:
         return None
-    different = np.unique(ranges)
-    return (different if len(different) < fewest else scan.ranges).tobytes()
+    different = np.unique(scan.ranges[valid])
+    packet = len(different) < fewest and _repeats_packet(np.where(valid, scan.ranges, math.nan), fewest)
+    return (different if packet else scan.ranges).tobytes()
+
+
+def _repeats_packet(ranges: Array, longest: int) -> bool:
+    """Return whether most ranges recur after some number of beams, beyond chance.
+
+    Ranges in coarse digits, and those of a wall, recur as often after one beam as after more.
+
+    Args:
+        ranges: ranges (m), NaN without a return, shape (n,); at least ``longest`` of them are returns.
+        longest: a repeated packet has fewer beams than this.
+    """
+    pairs = [(ranges[:-beams], ranges[beams:]) for beams in range(1, longest)]
+    counts = np.array([np.count_nonzero(np.isfinite(before) | np.isfinite(after)) for before, after in pairs])
+    shares = np.array([np.count_nonzero(before == after) for before, after in pairs]) / counts
+    chance = np.maximum.accumulate(shares)[:-1]
+    # Chance exceeds six standard deviations once in 10^9 (normal distribution).
+    highest = chance + 6.0 * np.sqrt(chance * (1.0 - chance) / counts[1:])
+    return bool((shares[1:] > np.maximum(highest, 0.5)).any())

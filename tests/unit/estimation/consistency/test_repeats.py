@@ -1,5 +1,7 @@
 """Values that repeat to the digit: accused only where their noise does not allow it."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -87,10 +89,32 @@ def test_a_lidar_that_repeats_one_packet_is_accused_however_its_revolutions_are_
     assert scans.frozen
 
 
-def test_a_lidar_of_coarse_digits_in_a_small_room_is_not_accused():
+@pytest.mark.parametrize("missing", [0, 4, 9])
+def test_a_packet_without_some_returns_is_accused_though_resampled_beams_are_lost(missing):
+    rng, scans = np.random.default_rng(10), WholeRepeats()
+    packet = shown(rng.normal(2.0, 0.01, 12), 0.001)
+    for cut in (0, 6, 3, 9):
+        points = np.delete((np.arange(452) + cut) % 12, rng.choice(452, 3))
+        codes = np.where(points < missing, 0, 255).astype(np.uint8)
+        ranges = np.where(points < missing, math.inf, np.take(packet, points))
+        scans.observe(scan_content(lidar_scan(ranges).model_copy(update={"codes": codes})), moved=0.05)
+    assert scans.frozen
+
+
+@pytest.mark.parametrize(
+    ("beams", "digit", "noise", "nearest", "farthest"),
+    [
+        (1440, 0.01, 0.1, 0.9, 1.05),
+        (1440, 0.01, 0.1, 0.9, 1.1),
+        (450, 0.001, 0.003, 0.9, 1.1),
+        (24, 0.001, 0.001, 0.9, 1.1),
+    ],
+)
+def test_a_lidar_of_coarse_digits_near_walls_is_not_accused(beams, digit, noise, nearest, farthest):
     rng, scans = np.random.default_rng(9), WholeRepeats()
-    for _ in range(40):
-        scans.observe(scan_content(lidar_scan(shown(rng.normal(1.0, 0.1, 1440).clip(0.9, 1.1), 0.01))), moved=0.0)
+    for _ in range(600):
+        ranges = rng.normal(1.0, noise, beams).clip(nearest, farthest)
+        scans.observe(scan_content(lidar_scan(shown(ranges, digit))), moved=0.05)
         assert not scans.frozen
 
 
