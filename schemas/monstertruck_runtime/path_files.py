@@ -34,7 +34,13 @@ COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
 """Names of a column in the formats of other programs."""
 _UNIT: Final = re.compile(r"(\w+)\s*[\[(]\s*(.*?)\s*[\])]")
 """A column's name with its unit in brackets."""
-_UNITS: Final = ("m", "rad", "m/s", "1")
+_UNITS: Final[Mapping[str, str]] = {
+    **dict.fromkeys((*COLUMNS["x"], *COLUMNS["y"]), "m"),
+    "yaw": "rad",
+    "direction": "1",
+    **dict.fromkeys(COLUMNS["speed"], "m/s"),
+}
+"""Units of the columns that are read."""
 _SHIFTED: Final = ("x_ref_m", "y_ref_m", "x_normvec_m", "y_normvec_m", "alpha_m")
 """TUM's trajectory for a local planner: reference line, its normals, and the shift along them."""
 EXPECTED: Final = "a path"
@@ -163,7 +169,7 @@ def _table(text: str, file: FilePath, columns: Sequence[str], *, closed: bool) -
     rows = rows_of(text, file, EXPECTED)
     if not rows:
         raise InputError(f"{file}: expected {EXPECTED}: the file is empty")
-    given, start = _names(text, rows, columns)
+    given, start = _names(text, file, rows, columns)
     names = [_plain(name, file, rows[0][0]) for name in given]
     for name in names:
         if name and names.count(name) > 1:
@@ -203,7 +209,9 @@ def _column(file: FilePath, rows: list[tuple[int, list[str]]], found: Mapping[st
     )
 
 
-def _names(text: str, rows: list[tuple[int, list[str]]], columns: Sequence[str]) -> tuple[list[str], int]:
+def _names(
+    text: str, file: FilePath, rows: list[tuple[int, list[str]]], columns: Sequence[str]
+) -> tuple[list[str], int]:
     """Return the column names, and the number of rows they occupy.
 
     The names come from the caller, the first row, or the last comment before it.
@@ -213,21 +221,32 @@ def _names(text: str, rows: list[tuple[int, list[str]]], columns: Sequence[str])
         return [name.strip().lower() for name in columns], 0 if _is_number(cells[0]) else 1
     if not _is_number(cells[0]):
         return [cell.lower() for cell in cells], 1
-    for line in reversed(text.removeprefix("\ufeff").splitlines()[: first - 1]):
-        comment = line.strip().lstrip(COMMENT)
+    before = text.removeprefix("\ufeff").splitlines()[: first - 1]
+    for number, line in reversed([*enumerate(before, start=1)]):
+        comment = _UNIT.sub(r"\1[\2]", line.strip().lstrip(COMMENT))
         names = [name.lower() for name in cells_of(comment, delimiter_of(comment))]
-        if line.strip().startswith(COMMENT) and len(names) == len(cells):
+        if not line.strip().startswith(COMMENT):
+            continue
+        if len(names) == len(cells):
             return names, 0
+        if names and all(_bare(name) in _UNITS for name in names):
+            raise InputError(f"{file}:{number}: names {len(names)} columns: expected {len(cells)}, as in line {first}")
     return ["x", "y"] if len(cells) == 2 else [f"column {i + 1}" for i in range(len(cells))], 0
 
 
-def _plain(name: str, file: FilePath, line: int) -> str:
-    """A column's name without its unit: ``x`` of ``x [m]``."""
+def _bare(name: str) -> str:
+    """Return a column's name without its unit: ``x`` for ``x [m]``."""
     found = _UNIT.fullmatch(name)
-    if found is None or not any(found[1] in names for names in (HEADER, *COLUMNS.values())):
+    return found[1] if found else name
+
+
+def _plain(name: str, file: FilePath, line: int) -> str:
+    """Return the bare name of a column that is read, and any other name unchanged; reject a wrong unit."""
+    found = _UNIT.fullmatch(name)
+    if found is None or found[1] not in _UNITS:
         return name
-    if found[2] not in _UNITS:
-        raise InputError(f"{file}:{line}: column {name}: expected one of the units {', '.join(_UNITS)}")
+    if found[2] != _UNITS[found[1]]:
+        raise InputError(f"{file}:{line}: column {name}: expected the unit {_UNITS[found[1]]}")
     return found[1]
 
 

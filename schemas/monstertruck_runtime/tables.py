@@ -8,7 +8,7 @@ from typing import Final
 from monstertruck_runtime.outside import reading, text_of
 
 DELIMITERS: Final = "\t;, "
-"""Delimiters; the first one that occurs in a row separates its cells."""
+"""Delimiters; the first one that occurs in a row separates its cells. White space beside another one does not."""
 COMMENT: Final = "#"
 _DECLARED: Final = re.compile(r"sep=(.)")
 """First line of a table by Excel, which names the delimiter."""
@@ -36,7 +36,7 @@ def rows_of(text: str, file: Path, expected: str) -> list[tuple[int, list[str]]]
         InputError: it is not a table; the message names the line.
     """
     rows = [(number, line) for number, line in enumerate(text.splitlines(), start=1) if _counts(line)]
-    declared = _DECLARED.fullmatch(rows[0][1].strip()) if rows else None
+    declared = _DECLARED.fullmatch(rows[0][1].strip(" ")) if rows else None
     if declared:
         del rows[0]
     delimiter = declared[1] if declared else delimiter_of(rows[0][1]) if rows else ","
@@ -49,7 +49,8 @@ def rows_of(text: str, file: Path, expected: str) -> list[tuple[int, list[str]]]
 
 def delimiter_of(line: str) -> str:
     """Return the first of ``DELIMITERS`` that occurs in a row; a comma if none does."""
-    return next((delimiter for delimiter in DELIMITERS if delimiter in line.strip(" ")), ",")
+    bare = re.sub(r"\s*([;,])\s*", r"\1", line.strip())
+    return next((delimiter for delimiter in DELIMITERS if delimiter in bare), ",")
 
 
 def cells_of(line: str, delimiter: str) -> list[str]:

@@ -44,20 +44,27 @@ export function mapText({ resolution, origin }) {
 }
 
 /**
- * Let buttons give the map to the browser.
+ * Let buttons give the map to the browser: both files are of the map at the first press, as the grid may grow.
  *
  * @param {import("./socket.js").Link} link
  * @param {{grid: Cells | null, tiles: Map<string, Cells>}} map
  */
 export function watchMapFiles(link, map) {
   link.on("map", () => { byId("task-map").hidden = false; });
-  link.on("robot", () => { byId("task-map").hidden = true; });
+  let half = null; // the map of which one file was given, and which one
+  link.on("robot", () => { byId("task-map").hidden = true; half = null; });
   const offer = (id, name, content) => {
     byId(id).textContent = name;
-    byId(id).onclick = () => map.grid && give(name, content());
+    byId(id).onclick = () => {
+      if (!map.grid) return;
+      const other = half && half.id !== id ? half : null;
+      const { grid, tiles } = other ?? { grid: map.grid, tiles: [...map.tiles.values()] };
+      half = other ? null : { id, grid, tiles };
+      give(name, content(grid, tiles));
+    };
   };
-  offer("map-image", IMAGE, () => mapImage(map.grid, map.tiles.values()));
-  offer("map-text", "map.yaml", () => mapText(map.grid));
+  offer("map-image", IMAGE, mapImage);
+  offer("map-text", "map.yaml", mapText);
 }
 
 /**

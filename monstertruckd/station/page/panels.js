@@ -181,7 +181,7 @@ export class Panels {
   /** The text of a cause with its source, which some texts name. */
   why({ text, reason: code, source }) {
     const why = text || reason(code);
-    return why.includes(source) ? why : words("stopped.by", { why, source });
+    return why.split(/[^\w:@-]+/).includes(source) ? why : words("stopped.by", { why, source });
   }
 
   /** When a stamp of the robot's clock was, by the newest state of the gate and when it came. */

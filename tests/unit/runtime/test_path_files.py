@@ -87,11 +87,16 @@ def test_our_own_table_may_have_speeds():
     assert (poses(swapped).tolist(), swapped.directions.tolist()) == ([[0, 0, 1], [1, 0, 1]], [1, -1])
 
 
-def test_a_table_of_numpy_is_read():
-    assert poses(read("# x y v\n0.00e+00 0.00e+00 1.00e+00\n1.00e+00 0.00e+00 5.00e-01\n")).tolist() == [
-        [0, 0, 0],
-        [1, 0, 0],
-    ]
+@pytest.mark.parametrize(
+    "head", ["# x y v", "# x [m] y [ m ] v (m/s)", "# saved by numpy\n# x y v\n# one lap of the hall"]
+)
+def test_a_table_of_numpy_is_read(head):
+    found = poses(read(f"{head}\n0.00e+00 0.00e+00 1.00e+00\n1.00e+00 0.00e+00 5.00e-01\n"))
+    assert found.tolist() == [[0, 0, 0], [1, 0, 0]]
+
+
+def test_a_comment_with_units_names_the_columns_in_its_order():
+    assert poses(read("# y [m] x [m]\n0 1\n0 2\n")).tolist() == [[1, 0, 0], [2, 0, 0]]
 
 
 def test_waypoints_may_be_json():

@@ -232,6 +232,8 @@ async def the_map_is_saved_as_the_files_of_map_server(page: Page, folder: Path) 
         async with page.expect_download() as download:
             await page.click(f"#map-{part}")
         await (await download.value).save_as(folder / (await download.value).suggested_filename)
+        await say(page, {"kind": "map", "version": 8, **grid, "origin": [-2, 2, 0]})  # it grows between the presses
+        await page.wait_for_timeout(200)
     world = load_map(folder / "map.yaml")
     assert (world.resolution, world.origin) == (0.5, (-1.0, 2.0))
     assert world.cells.tolist() == [[0, 100, -1], [-1, 0, 100]]
