@@ -1,4 +1,4 @@
-"""Device side of a cable, for emulators: its byte streams, line faults, ports in memory and on ptys."""
+"""Device side of a cable, for emulators: byte streams, line faults, in-memory ports and ptys."""
 
 import asyncio
 import contextlib
@@ -23,10 +23,10 @@ FRAME: Final = 0.001
 
 
 class DeviceEnd:
-    """Device side of a port, which an emulator reads and writes, whichever process has the host side open.
+    """Device side of a port, read and written by an emulator, whichever process has opened the host side.
 
     Bytes without a reader are dropped, as with a USB device. ``baud`` paces both directions like a real line (10 bits
-    per byte). It also injects cable faults.
+    per byte). The end also injects cable faults.
     """
 
     def __init__(self, name: str) -> None:
@@ -43,7 +43,7 @@ class DeviceEnd:
         self._deliver: Callable[[bytes], None] | None = None
 
     def connect(self, deliver: Callable[[bytes], None] | None) -> None:
-        """Connect the host that opened the port; None when it closes the port."""
+        """Connect the host that opened the port, or pass None when the host closes it."""
         self._deliver = deliver
 
     async def read(self, within: float | None = None) -> bytes:
@@ -65,7 +65,7 @@ class DeviceEnd:
         self._send(self._in, len(data), partial(self._accept, data))
 
     def _send(self, direction: "_Direction", count: int, arrive: Callable[[], None], after: float = 0.0) -> None:
-        """Deliver ``count`` bytes after all earlier ones and their own transfer time."""
+        """Deliver ``count`` bytes after all earlier bytes, plus their own transfer time."""
         delay = self.faults.delay + after
         if self.baud is None and delay <= 0 and direction.is_free():
             arrive()
@@ -90,7 +90,7 @@ CABLE: Final = contextvars.Context()
 
 
 class _Direction:
-    """One direction of the line. Timers may fire in any order; bytes arrive in the order sent."""
+    """One direction of the line. Timers may fire in any order, but bytes arrive in the order sent."""
 
     def __init__(self) -> None:
         self._free = 0.0
@@ -112,7 +112,7 @@ class _Direction:
 
 
 class LineFaults:
-    """Faults of a cable; all off by default. ``seed`` sets the random numbers."""
+    """Faults of a cable; all off by default. ``seed`` seeds the random faults."""
 
     def __init__(self) -> None:
         self.stalled = False
@@ -142,7 +142,7 @@ class LineFaults:
         self._state = (seed * 2654435761 + 1) & 0xFFFFFFFF
 
     def corrupt(self, data: bytes) -> list[bytes]:
-        """Apply the faults; returns the chunks to deliver."""
+        """Apply the faults; return the chunks to deliver."""
         if self.garbage:
             data, self.garbage = self.garbage + data, b""
         if self.lose_rate > 0 and self._random() < self.lose_rate:
@@ -161,7 +161,7 @@ class LineFaults:
         return [data[i : i + self.chunk] for i in range(0, len(data), self.chunk)]
 
     def shorten(self, data: bytes) -> bytes:
-        """Bytes of one host write that enter the line."""
+        """Return the bytes of one host write that reach the line."""
         if self.short_writes <= 0 or len(data) < 2:
             return data
         self.short_writes -= 1
@@ -175,7 +175,7 @@ class LineFaults:
 
 
 class EmulatedPort(Protocol):
-    """A port whose device is emulated: can be plugged and unplugged."""
+    """A port with an emulated device that can be plugged in and unplugged."""
 
     name: str
     device: DeviceEnd
@@ -218,7 +218,7 @@ class MemoryPort:
         """Open the host side.
 
         Raises:
-            DeviceLostError: unplugged.
+            DeviceLostError: the cable is unplugged.
             PortBusyError: it is already open.
         """
         if not self._plugged:
@@ -237,13 +237,13 @@ class MemoryPort:
 
 @contextlib.contextmanager
 def reserved(*links: Path) -> Iterator[None]:
-    """Reserve the names of ptys for this program within the context, without replacing those of other programs.
+    """Reserve pty names for this program within the context, without replacing those of other programs.
 
     Args:
         links: symlinks to create; their folders must exist.
 
     Raises:
-        BusyError: another program serves one of them; the text names its process.
+        BusyError: another program serves one of the links; the message names its process.
         InputError: the name exists and is not a link.
         OSError: the link cannot be created.
     """
@@ -271,7 +271,7 @@ def reserved(*links: Path) -> Iterator[None]:
 
 
 class PtyPort:
-    """A pty behind a stable symlink; unplugging closes it, replugging creates a new one.
+    """A pty behind a stable symlink; unplugging closes the pty, and replugging creates a new one.
 
     Args:
         path: symlink to create; its folder must exist.
@@ -303,7 +303,7 @@ class PtyPort:
             self.device.on_plug(True)
 
     def unplug(self) -> None:
-        """Remove the symlink and close the pty: reads of the host's end fail with EIO."""
+        """Remove the symlink and close the pty: reads on the host side fail with EIO."""
         if self._fds is None:
             return
         master, slave = self._fds
@@ -342,14 +342,14 @@ class PtyPort:
 
 
 class SocketPort:
-    """A network device, emulated at an address of this computer; it serves one client at a time.
+    """A network device emulated at a loopback address; it serves one client at a time.
 
-    Unplugged, it is silent, as with a pulled cable. Plugged in again, it behaves as after a power loss and resets the
-    earlier connection.
+    While unplugged, it is silent. When plugged in again, it behaves as after a power loss and resets the earlier
+    connection.
 
     Args:
-        address: address of 127.0.0.0/8.
-        number: TCP port; 0: any free one.
+        address: address in 127.0.0.0/8.
+        number: TCP port; 0 selects any free port.
 
     Raises:
         BusyError: another program uses the port.
@@ -383,7 +383,7 @@ class SocketPort:
             self.device.on_plug(True)
 
     def unplug(self) -> None:
-        """Unplug the cable: the host receives nothing any more."""
+        """Unplug the cable: the host no longer receives anything."""
         if not self._plugged:
             return
         self._plugged = False

@@ -1,9 +1,9 @@
 """Tables of device roles and device kinds; every list of devices derives from them.
 
-A role is the purpose of a device: its key in the configuration, the topics it writes and reads, its place in the start
-order. A kind is a product with its driver, the value of ``kind:``. Other distributions may add both:
-``docs/writing-a-driver.md``. The modules of a kind are loaded on use, so that listing kinds, checking a configuration
-and ``--help`` cost nothing.
+A role is the purpose of a device: its key in the configuration, the topics it writes and reads, and its place in the
+start order. A kind is a product with its driver; its name is the value of ``kind:``. Other distributions may add roles
+and kinds: ``docs/writing-a-driver.md``. A kind's modules are loaded on first use, so that listing kinds, checking a
+configuration and ``--help`` stay fast.
 """
 
 import json
@@ -76,7 +76,7 @@ class RoleSpec:
 
     @property
     def topic(self) -> Topic[Any]:
-        """Its main topic."""
+        """The role's main topic."""
         return next(iter(self.writes.values()))
 
 
@@ -94,7 +94,7 @@ def _shaft(index: int) -> RoleSpec:
 
 
 def _by_shaft(name: str, of_shafts: tuple[Topic[Any], ...]) -> dict[str, Topic[Any]]:
-    """Parameters of a driver for several shafts: ``name``, ``name_2`` and so on."""
+    """Driver parameters for several shafts: ``name``, ``name_2`` and so on."""
     return {f"{name}_{i}" if i > 1 else name: topic for i, topic in enumerate(of_shafts, 1)}
 
 
@@ -230,7 +230,7 @@ OUR_ROLES: Final = (
 
 
 class UsbIdentity(NamedTuple):
-    """USB identity of a device, also used by the emulated computer."""
+    """USB identity of a device; the emulated computer also uses it."""
 
     usb_id: str
     """``vendor:product``."""
@@ -243,8 +243,8 @@ class UsbIdentity(NamedTuple):
 class DeviceKind(Plugin):
     """One kind of device; ``implementation`` is its driver.
 
-    A driver is a ``Service``. Its constructor takes the settings, the opened port, the clock, and as keywords the ends
-    of its role's topics, ``events`` and ``name``.
+    A driver is a ``Service``. Its constructor takes the settings, the port and the clock; its role's topics, ``events``
+    and ``name`` are keyword arguments.
     """
 
     roles: tuple[RoleSpec, ...]
@@ -270,7 +270,7 @@ class DeviceKind(Plugin):
 
     @property
     def role(self) -> RoleSpec:
-        """Its primary role."""
+        """The kind's primary role."""
         return self.roles[0]
 
     async def serve(self, emulator: Emulator, end: DeviceEnd) -> None:
@@ -286,7 +286,7 @@ class DeviceKind(Plugin):
         """Create an emulated device: an ``Emulator``, or a ``FileEmulator`` for a monitor; loads its module.
 
         Raises:
-            InputError: the factory does not load, or returns another object.
+            InputError: the factory cannot be loaded, or returns an object of another type.
         """
         made, wanted = self.called(self.emulator, setup), FileEmulator if self.opens == "computer" else Emulator
         if not isinstance(made, wanted):
@@ -296,22 +296,22 @@ class DeviceKind(Plugin):
         return made
 
     async def identify(self, where: Any, clock: Clock, settings: Schema | None = None) -> dict[str, Any]:
-        """Identify the device at a place, without motion.
+        """Identify the connected device without moving it.
 
         Args:
-            where: ``Port`` of a serial line or of an I2C bus, path of a video device, or the ``Computer``.
+            where: ``Port`` for a serial line or an I2C bus, path of a video device, or the ``Computer``.
             clock: time.
-            settings: settings of the driver; None: defaults.
+            settings: driver settings; None for the defaults.
 
         Returns:
-            JSON-compatible: the facts reported by the device; for a device on a port preceded by ``device`` and
-            ``port``.
+            JSON-compatible dict of the facts reported by the device, preceded by ``device`` and ``port`` if it is on a
+            port.
 
         Raises:
-            DeviceLostError: not plugged in.
-            DeviceTimeoutError: silence.
+            DeviceLostError: the device is not plugged in.
+            DeviceTimeoutError: the device does not answer.
             ProtocolError: the device violates its protocol.
-            WrongDeviceError: another device.
+            WrongDeviceError: another device answers.
             PortBusyError: another process holds the port.
         """
         settings = settings or self.default_settings()
@@ -322,7 +322,7 @@ class DeviceKind(Plugin):
         return {"device": self.doc, "port": where.name, **facts}
 
     async def _facts(self, where: Any, clock: Clock, settings: Schema) -> dict[str, Any]:
-        """Identity of a device: values by name, ready for JSON."""
+        """Return the device's identity: JSON-compatible values by name."""
         asking = self.called(self.identity, where, clock, settings)
         with self.refusing(self.identity):
             found = await asking
@@ -348,14 +348,14 @@ not roles (a test compares).
 
 
 class DeviceCatalog(Catalog[DeviceKind]):
-    """All device kinds and roles: built-in ones, then those of other distributions."""
+    """All device kinds and roles: built-in ones first, then those from other distributions."""
 
     def __init__(self, *rows: DeviceKind) -> None:
         super().__init__("monstertruck.devices", *rows)
         self._roles = {role.name: role for role in OUR_ROLES}
 
     def fault(self, row: Any) -> str | None:
-        """Error in a kind of another distribution, or in a role it adds."""
+        """Error in another distribution's kind or in a role that it adds; None if there is none."""
         if fault := super().fault(row):
             return fault
         if not row.roles:
@@ -399,10 +399,10 @@ class DeviceCatalog(Catalog[DeviceKind]):
         return tuple(kind for kind in self.values() if role in (known.name for known in kind.roles))
 
     def named(self, name: str) -> DeviceKind:
-        """Return a kind by its name, or the first kind of a role.
+        """Return the kind with a name, or the first kind of a role.
 
         Raises:
-            InputError: unknown name.
+            InputError: the name is unknown.
         """
         kinds = (self[name],) if name in self else self.of_role(name)
         if not kinds:
@@ -691,11 +691,11 @@ DEVICES: Final = DeviceCatalog(
 
 
 def start_order() -> tuple[str, ...]:
-    """Roles in their restart order after a hub returned."""
+    """Roles in the order in which they restart after a hub returns."""
     roles = [role for role in DEVICES.roles.values() if role.duty is not Duty.MONITOR]
     return tuple(role.name for role in sorted(roles, key=lambda role: role.start))
 
 
 def started_apart() -> tuple[str, ...]:
-    """Roles that load their hub when they start."""
+    """Roles that put a load on their hub when they start."""
     return tuple(role.name for role in DEVICES.roles.values() if role.loads_hub)

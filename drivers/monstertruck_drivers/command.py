@@ -1,4 +1,4 @@
-"""Program that acts as a device: a link reads its output, and the device is lost when the program exits."""
+"""A program that acts as a device: its output is the device's data, and the device is lost when the program exits."""
 
 import asyncio
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from monstertruck_runtime.errors import DeviceLostError
 
 
 class CommandPort:
-    """Starts a program, without a shell, each time the port is opened, and ends it with the link.
+    """Starts a program, without a shell, each time the port is opened, and ends it when the link closes.
 
     Args:
         command: program and arguments.
@@ -47,7 +47,7 @@ class _ProgramOutput(asyncio.SubprocessProtocol):
         self._said = b""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """The program runs."""
+        """The program has started."""
         self._program = cast("asyncio.SubprocessTransport", transport)
         self.link = Link(self._name, lambda _: None, self._end, limit=STREAM_LIMIT)
 

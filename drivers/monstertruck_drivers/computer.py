@@ -24,14 +24,14 @@ class Sysfs:
         self.root = root
 
     def text(self, path: str) -> str | None:
-        """Content of an attribute without surrounding blanks; None if it is missing or unreadable."""
+        """Attribute text without surrounding whitespace; None if it is missing or unreadable."""
         try:
             return (self.root / path).read_text(errors="backslashreplace").strip()
         except OSError:
             return None
 
     def number(self, path: str, base: int = 10) -> int | None:
-        """Content as an integer; None if it is not one."""
+        """Attribute value as an integer; None if it is not an integer."""
         try:
             return int(self.text(path) or "", base)
         except ValueError:
@@ -48,7 +48,7 @@ class Sysfs:
         """Set an attribute.
 
         Raises:
-            OSError: it is missing, not permitted, or rejected.
+            OSError: the attribute is missing, not writable, or rejects the value.
         """
         with (self.root / path).open("r+") as attribute:  # an attribute is never created
             attribute.write(text)
@@ -60,17 +60,17 @@ SUBSYSTEMS: Final = ("usb", "tty", "video4linux")
 
 
 class Watcher(Protocol):
-    """Source of change notifications; it may miss some, so its user also polls."""
+    """Source of change notifications; it may miss changes, so callers also poll."""
 
     def start(self, hint: Callable[[], None]) -> None:
         """Call ``hint`` on the running loop whenever something may have changed, until ``stop``."""
 
     def stop(self) -> None:
-        """Stop the announcements; may be called repeatedly."""
+        """Stop the notifications; may be called repeatedly."""
 
 
 class NoWatcher:
-    """Watcher for machines without udev: the tree is only polled."""
+    """Watcher for machines without udev, where the tree is only polled."""
 
     def start(self, hint: Callable[[], None]) -> None:
         """Do nothing."""
@@ -80,7 +80,7 @@ class NoWatcher:
 
 
 class UdevWatcher:
-    """Listens to udev events after its rules ran, so links and permissions are up to date.
+    """Listens to udev events, which arrive after the udev rules have run, so links and permissions are up to date.
 
     Args:
         monitor: a ``pyudev.Monitor``, or an object with its interface.
@@ -138,7 +138,7 @@ async def run_command(arguments: Sequence[str]) -> tuple[int, str]:
         Exit code and output.
 
     Raises:
-        OSError: it cannot be started.
+        OSError: the program cannot be started.
     """
     process = await asyncio.create_subprocess_exec(
         *arguments, stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT
@@ -154,7 +154,7 @@ async def run_command(arguments: Sequence[str]) -> tuple[int, str]:
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """Files, nodes and programs; tests replace them with an emulated machine."""
+    """Files, device nodes and programs; tests replace them with an emulated machine."""
 
     clock: Clock
     sysfs: Sysfs = field(default_factory=Sysfs)
@@ -179,10 +179,10 @@ class Disk:
 
 
 def disk_of(path: Path) -> Disk:
-    """The file system of ``path`` or of its nearest parent that exists.
+    """The file system that contains ``path`` or its nearest existing parent.
 
     Raises:
-        DeviceError: its size cannot be determined.
+        DeviceError: the size of the file system cannot be determined.
     """
     while not path.exists() and path != path.parent:
         path = path.parent
@@ -198,7 +198,7 @@ ROOT = Path("/")
 
 @dataclass(frozen=True, slots=True)
 class Computer:
-    """The computer that runs the daemon; simulations replace it by an emulated one."""
+    """The computer that runs the daemon; simulations replace it with an emulated one."""
 
     machine: Machine
     """Its USB tree."""
@@ -211,6 +211,6 @@ class Computer:
 
     @classmethod
     def at(cls, root: Path, clock: Clock) -> Self:
-        """Return the real computer, or the one emulated by another process in ``root``, without announcements."""
+        """Return the real computer, or the one another process emulates in ``root``, without change notifications."""
         machine = Machine(clock, Sysfs(root / "sys"), root / "dev")
         return cls(machine, root, open_watcher if root == ROOT else NoWatcher)

@@ -1,6 +1,6 @@
 """Devices of a robot, with their ports and settings: the sections ``devices`` and ``monitors``.
 
-Both have a key for every role of the catalog, and accept the settings of every kind that fills the role.
+Both sections have a key for every role in the catalog and accept the settings of every kind that can fill that role.
 """
 
 import math
@@ -48,15 +48,15 @@ class PortConfig(Schema):
     baud: Baud | None = None
     """Baud rate; null: the device's default. USB-CDC devices ignore it"""
     dtr: bool = True
-    """Level of the line DTR while the port is open; false lets an RPLIDAR's motor turn"""
+    """Level of the DTR line while the port is open; false lets an RPLIDAR's motor turn"""
     rts: bool = True
-    """Level of the line RTS while the port is open"""
+    """Level of the RTS line while the port is open"""
     framing: Framing | None = None
     """Bits per byte; null: the device's default"""
 
     @property
     def label(self) -> str:
-        """Path of the node."""
+        """Path of the device node."""
         return str(self.path)
 
 
@@ -100,7 +100,7 @@ _WAYS: Final = {"hub": "port by hub", "address": "port by address", "command": "
 
 
 def _way(port: Any) -> str:
-    """Return the tag of the union variant of ``port``: not one of its keys, so that error messages find their line."""
+    """Return the union tag of ``port``; it is not one of its keys, so that error messages can find the line."""
     keys = port if isinstance(port, dict) else vars(port) if isinstance(port, Schema) else {}
     return next((way for key, way in _WAYS.items() if key in keys), "port by path")
 
@@ -115,7 +115,7 @@ AnyPort = Annotated[
 
 
 class Device(Schema, Generic[C]):
-    """One device: its port, its mount, its driver."""
+    """One device: its port, mount and driver."""
 
     port: AnyPort
     """Where the device is connected."""
@@ -137,7 +137,7 @@ class Device(Schema, Generic[C]):
 
 
 def kind_of(settings: Schema) -> DeviceKind:
-    """Kind of device with these settings."""
+    """Device kind that has these settings."""
     return DEVICES[str(vars(settings)["kind"])]
 
 
@@ -149,7 +149,7 @@ class _Devices(Schema):
         return dict(_present(self))
 
     def at_present(self, sysfs: Sysfs) -> Self:
-        """The same devices, with the hubs of ports replaced by the kernel's current names."""
+        """The same devices, with each port's hub replaced by the kernel's current name for it."""
         moved = {
             role: device.model_copy(update={"port": device.port.at_present(sysfs)})
             for role, device in self.present().items()
@@ -162,12 +162,12 @@ class _Devices(Schema):
         return {role: device for role, device in self.present().items() if DEVICES.roles[role].topic in SCANS}
 
     def measures(self, topic: Topic[Any]) -> bool:
-        """Whether a configured device publishes a sensor's topic."""
+        """Whether a configured device publishes a sensor topic."""
         written = ((*DEVICES.roles[role].writes.values(), *d.kind.also.values()) for role, d in self.present().items())
         return any(topic in topics for topics in written)
 
     def shafts(self) -> dict[str, Device[Any]]:
-        """Controllers of the driven shafts, by shaft; one may control several."""
+        """Controllers of the driven shafts, by shaft; one device may control several shafts."""
         return {SHAFTS[i]: device for role, device in self.present().items() for i in _served(role, device)}
 
     def controller(self) -> str | None:
@@ -175,7 +175,7 @@ class _Devices(Schema):
         return next((role for role, device in self.present().items() if 0 in _served(role, device)), None)
 
     def steers(self) -> tuple[str, SteeringOutputs] | None:
-        """Role of the steering device with its steering outputs; None if nothing steers."""
+        """Role and steering outputs of the steering device; None if no device steers."""
         return next(self._steering(), None)
 
     def _steering(self) -> Iterator[tuple[str, SteeringOutputs]]:
@@ -261,7 +261,7 @@ def _served(role: str, device: Device[Any]) -> tuple[int, ...]:
 
 
 class _Monitors(Schema):
-    """Monitors of the computer itself, without a port; omitted monitors do not run."""
+    """Monitors of the computer itself, without a port; monitors that are omitted do not run."""
 
     def present(self) -> dict[str, Schema]:
         """Settings of the configured monitors, by role."""
@@ -281,7 +281,7 @@ def _section(base: type[Schema], name: str, *, monitors: bool) -> Any:
 
 
 def _choice(role: RoleSpec, *, monitors: bool) -> Any:
-    """One of the kinds that fill a role."""
+    """Union of the settings of all kinds that can fill a role."""
     kinds = {kind.name: kind.settings_class() for kind in DEVICES.of_role(role.name)}
     models = {name: model if monitors else Device[model] for name, model in kinds.items()}  # type: ignore[valid-type]
     if len(models) == 1:

@@ -1,4 +1,4 @@
-"""Disobedient emulated motor controllers: how they deviate from their commanded targets."""
+"""Emulated motor controllers that disobey: how they deviate from their commanded targets."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -6,7 +6,7 @@ from typing import Self
 
 
 class Disobedience(StrEnum):
-    """Kind of deviation from the targets."""
+    """Kind of deviation from the commanded target."""
 
     IGNORE = "ignore"
     """Lower and opposite targets are ignored: the motor keeps its speed."""
@@ -19,7 +19,7 @@ class Disobedience(StrEnum):
 
 
 class StoppedBy(StrEnum):
-    """Weakest stop that still works on the motor; the stronger ones, listed after it, work too."""
+    """Weakest stop that still stops the motor; the stronger stops, listed after it, also work."""
 
     STAGE = "stage"
     """Power stage off."""
@@ -39,7 +39,7 @@ class DisobedientMotor:
 
     Args:
         kind: how it disobeys.
-        rpm: motor speed of CREEP and RUN, rpm, controller's own sign.
+        rpm: motor speed for CREEP and RUN (rpm), with the controller's sign.
         stopped_by: weakest stop that still works.
     """
 
@@ -49,10 +49,10 @@ class DisobedientMotor:
 
     @classmethod
     def parse(cls, *words: str) -> Self | None:
-        """Parse the words of a fault command; ``off`` gives None.
+        """Parse the words of a fault command; return None for ``off``.
 
         Raises:
-            ValueError: expected ``USAGE``.
+            ValueError: the words do not match ``USAGE``.
         """
         if words == ("off",):
             return None
@@ -64,15 +64,15 @@ class DisobedientMotor:
         return cls(disobedience, rpm, StoppedBy(rest[0]) if rest else StoppedBy.STAGE)
 
     def target(self, asked: float | None, present: float, *, line: bool = False) -> float | None:
-        """Return the speed to which the motor is driven.
+        """Return the speed that the controller drives the motor to.
 
         Args:
-            asked: commanded speed (rpm); None: power stage off.
+            asked: commanded speed (rpm); None if the power stage is off.
             present: motor speed (rpm).
             line: whether the hardware input requests a quick stop.
 
         Returns:
-            Speed (rpm); None: power stage off.
+            Speed (rpm); None if the power stage is off.
         """
         if asked is None and self.stopped_by is StoppedBy.STAGE:
             return None

@@ -1,4 +1,4 @@
-"""Emulator interface, the physics available to emulators, and the parts to build an emulator from."""
+"""Emulator interface, the physics available to emulators, and building blocks for emulators."""
 
 import shutil
 from collections.abc import Callable, Iterable
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 class FileTree:
-    """Files below a folder; each is replaced atomically, and only if its text changes.
+    """Files below a folder; a file is replaced atomically, and only if its text changes.
 
     Args:
         root: folder that replaces /, or a part of it.
@@ -30,7 +30,7 @@ class FileTree:
         self._texts: dict[str, str] = {}
 
     def put(self, path: str, text: str) -> None:
-        """Write ``text`` to the file; append a line end if it has none."""
+        """Write ``text`` to the file; append a newline if it has none."""
         if self._texts.get(path) == text:
             return
         self._texts[path] = text
@@ -58,7 +58,7 @@ class ReceivedBytes(bytearray):
     KEPT: Final = 1 << 16
 
     def extend(self, data: Iterable[SupportsIndex], /) -> None:
-        """Append bytes; drop the oldest above ``KEPT``."""
+        """Append bytes, and drop the oldest beyond ``KEPT``."""
         super().extend(data)
         if len(self) > self.KEPT:
             del self[: -self.KEPT]
@@ -66,7 +66,7 @@ class ReceivedBytes(bytearray):
 
 @runtime_checkable
 class Emulator(Protocol):
-    """Device side of a protocol, byte for byte, with the device's persistent state.
+    """Device side of a protocol, byte for byte, including the device's persistent state.
 
     Its attribute ``signals``, a ``Signals``, may be absent: see ``signals_of``.
     """
@@ -77,13 +77,13 @@ class Emulator(Protocol):
         """Serve until cancelled; survives hosts that connect, disconnect and die."""
 
     def power_cycle(self) -> None:
-        """Switch the supply off and on: volatile state is lost, stored settings stay."""
+        """Switch the supply off and on: volatile state is lost, and stored settings persist."""
 
     def inject(self, fault: str, *values: str) -> None:
         """Start (or end) a device fault by name.
 
         Raises:
-            InputError: unknown fault or invalid value; the text lists the known ones.
+            InputError: unknown fault or invalid value; the message lists the known faults.
         """
 
 
@@ -112,7 +112,7 @@ class RangeSource(Protocol):
     """Source of a lidar's scans."""
 
     def scan(self, time_ns: int) -> NDArray[np.int32]:
-        """Raw distances of one revolution that started at ``time_ns``, mm.
+        """Raw distances (mm) of one revolution that started at ``time_ns``.
 
         Shape (769,), step 0..768; values below 20 are the sensor's error codes.
         """
@@ -123,7 +123,7 @@ SIGMAS: Final = 2.0
 
 
 class RangeSheet(NamedTuple):
-    """Ranges of a scanner according to its data sheet."""
+    """A scanner's range specifications according to its data sheet."""
 
     least: float
     """Minimum range (m)."""
@@ -138,7 +138,7 @@ class RangeSheet(NamedTuple):
 
     @property
     def noise(self) -> float:
-        """Standard deviation of a range close by (m): the error bound holds for `SIGMAS` standard deviations."""
+        """Standard deviation of a short range (m): the data sheet's error bound equals `SIGMAS` standard deviations."""
         return self.error / SIGMAS
 
     @property
@@ -151,21 +151,21 @@ class BeamSource(Protocol):
     """Source of beam ranges for a scanner of any geometry."""
 
     def beams(self, bearings: Array, times_ns: NDArray[np.int64], sheet: RangeSheet) -> Array:
-        """Ranges of single beams, shape (n,) (m): +inf: nothing within range, NaN: the measurement failed.
+        """Ranges of single beams (m), shape (n,): +inf if nothing is within range, NaN if the measurement failed.
 
         Args:
             bearings: counter-clockwise from the scanner's x axis, shape (n,) (rad).
             times_ns: times of the beams, shape (n,), increasing, over at most half a second.
-            sheet: reach and noise.
+            sheet: maximum range and noise.
         """
 
 
 class ScannedRoom(RangeSource, BeamSource, Protocol):
-    """Source of ranges for any lidar."""
+    """Range source for any lidar."""
 
 
 class MotorReading(NamedTuple):
-    """State of a motor shaft at one time, with the controller's sign."""
+    """Motor shaft state at one time, with the controller's sign."""
 
     turns: float
     """Shaft revolutions since power-up of the world."""
@@ -179,7 +179,7 @@ class MotorPlant(Protocol):
     """A motor with its load, driven by a speed controller."""
 
     def command(self, time_ns: int, target_rpm: float | None, accel_rpm_s: float) -> None:
-        """Ramp towards ``target_rpm`` from ``time_ns`` on; None switches the power stage off, so the motor coasts."""
+        """Ramp towards ``target_rpm``, starting at ``time_ns``; None switches the power stage off (coasting)."""
 
     def reading(self, time_ns: int) -> MotorReading:
         """State at ``time_ns`` (never earlier than a time already requested)."""
@@ -193,11 +193,11 @@ class PulseSource(Protocol):
 
 
 class ServoPlant(Protocol):
-    """Servos with their load; ``advance`` is called before any target changes."""
+    """Servos with their loads; ``advance`` must be called before any target changes."""
 
     @property
     def inputs(self) -> frozenset[int]:
-        """Channels of the servo controller that are analog inputs."""
+        """Servo-controller channels that are analog inputs."""
 
     def attach(self, pulses: PulseSource) -> None:
         """Set the controller whose pulses move the servos."""
@@ -227,7 +227,7 @@ class CompassReading:
 
 
 class AttitudeSource(Protocol):
-    """Source of a compass's true readings."""
+    """Source of true compass readings."""
 
     def compass(self, time_ns: int) -> CompassReading:
         """Reading at ``time_ns``."""
@@ -244,14 +244,14 @@ class ImuReading(NamedTuple):
 
 
 class ImuSource(Protocol):
-    """Source of an inertial measurement unit's true readings."""
+    """Source of true readings for an inertial measurement unit."""
 
     def imu(self, time_ns: int) -> ImuReading:
         """Reading at ``time_ns``."""
 
 
 class WheelSource(Protocol):
-    """Source of the rear wheels' angles for their encoders."""
+    """Source of the rear wheel angles for the encoders."""
 
     def wheels(self, time_ns: int) -> tuple[float, float]:
         """Cumulative angles of the left and right wheel (rad), forward positive."""
@@ -261,35 +261,35 @@ class SonarSource(Protocol):
     """Source of the robot's sonar echoes, by sonar name."""
 
     def fire(self, name: str, time_ns: int) -> None:
-        """Send a ping from a sonar.
+        """Fire a ping from a sonar.
 
         Raises:
-            InputError: the robot has no sonar of that name.
+            InputError: the robot has no sonar with that name.
         """
 
     def range(self, name: str) -> float:
-        """Distance measured by a sonar's latest ping (m), available once its echo is back; inf: no echo."""
+        """Distance measured by a sonar's latest ping (m), available once the echo has returned; inf if none."""
 
 
 class JointSource(Protocol):
     """Joints of a mount: a pitch joint on the body, a roll joint on the pitch joint, the device on the roll joint."""
 
     def angles(self, times_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """True pitch and roll, rad, REP 103, at increasing times within the last second; each (n,)."""
+        """True pitch and roll (rad, REP 103) at increasing times within the last second; two arrays of shape (n,)."""
 
 
 class ViewSource(Protocol):
-    """Source of a camera's pictures."""
+    """Source of camera images."""
 
     def exposure(self, time_ns: int, size: tuple[int, int], /) -> Callable[[], NDArray[np.uint8]]:
-        """Return a function that draws the image of a time; callable in any thread, one call at a time.
+        """Return a function that renders the image at one time; it may be called from any thread, one call at a time.
 
         Args:
             time_ns: time of the exposure.
             size: width and height (pixels).
 
         Returns:
-            Function that returns an image (height, width, 3): red, green, blue; the top row first.
+            Function that returns an image of shape (height, width, 3): red, green, blue; top row first.
         """
 
 
@@ -303,7 +303,7 @@ class Horn(NamedTuple):
 
 
 class Physics(Protocol):
-    """Simulated world as devices measure it."""
+    """The simulated world as the devices measure it."""
 
     @property
     def lidar(self) -> ScannedRoom:
@@ -315,7 +315,7 @@ class Physics(Protocol):
 
     @property
     def view(self) -> ViewSource:
-        """Source of camera pictures of the truck's surroundings."""
+        """Source of camera images of the truck's surroundings."""
 
     @property
     def motors(self) -> tuple[MotorPlant, ...]:
@@ -323,7 +323,7 @@ class Physics(Protocol):
 
     @property
     def servos(self) -> ServoPlant:
-        """Steering servos of the axles, with the inputs of their controller."""
+        """Axle steering servos, with the analog inputs of their controller."""
 
     @property
     def compass(self) -> AttitudeSource:
@@ -342,7 +342,7 @@ class Physics(Protocol):
         """Rolling rear wheels."""
 
     def battery_volts(self, time_ns: int) -> float:
-        """Voltage behind the battery's divider."""
+        """Output voltage of the battery divider."""
 
     def horns(self) -> tuple[Horn, Horn]:
         """Assembly of the mount's pitch and roll servos."""
@@ -351,7 +351,7 @@ class Physics(Protocol):
         """Attach the lidar to a mount with joints."""
 
     def mount_torque(self, joint: int) -> float:
-        """Torque of the lidar on its pitch (0) or roll (1) joint at the world's latest instant (Nm)."""
+        """Torque of the lidar on its pitch (0) or roll (1) joint at the latest simulated time (Nm)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -374,5 +374,5 @@ class EmulatorSetup:
 
     @property
     def room(self) -> ScannedRoom:
-        """Source of the ranges of the lidar in this role."""
+        """Range source for the lidar in this role."""
         return self.physics.lidar_2 if self.role == DeviceRole.LIDAR_2 else self.physics.lidar

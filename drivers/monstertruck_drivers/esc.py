@@ -20,7 +20,7 @@ class UnmeasuredMotor:
     """Follows ``cmd/drive`` and reports the commanded rate, delayed as configured.
 
     Args:
-        esc: speed controller.
+        esc: speed controller settings.
         clock: time.
         commands: ``cmd/drive``.
         out: ``sensor/drive``.
@@ -51,7 +51,7 @@ class UnmeasuredMotor:
         self._ready_at = self._clock.now() + round(self._esc.arming * SECOND)
 
     def pulse_us(self) -> float:
-        """Pulse to send now (us); neutral without a fresh command to run."""
+        """Pulse to send now (us); neutral without a fresh run command."""
         return self._esc.pulse_us(self._wanted(self._clock.now()))
 
     def _wanted(self, now: int) -> float:
@@ -63,7 +63,7 @@ class UnmeasuredMotor:
         return min(max(command.motor_velocity, -limit), limit)
 
     def _mode(self, now: int) -> DriveMode:
-        """Mode of the motor; a stale command to run is a stop."""
+        """Mode of the motor; a stale run command counts as a stop."""
         command = self._commands.latest
         if command is None:
             return DriveMode.DISABLED
@@ -71,7 +71,7 @@ class UnmeasuredMotor:
         return DriveMode.QUICK_STOP if stale else MODES[command.action]
 
     def publish(self, stamp: int, received: int) -> None:
-        """Publish the estimated rate of the motor; nothing while the speed controller receives its neutral pulses."""
+        """Publish the estimated rate of the motor; publish nothing during the initial neutral pulses."""
         if stamp < self._ready_at:
             return
         wanted = self._wanted(stamp)

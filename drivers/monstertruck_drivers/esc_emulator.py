@@ -1,7 +1,7 @@
 """Emulated speed controller (ESC) with a pulse input.
 
 A real one reads a pulse every 20 ms, does not move before it has received neutral pulses for a while, lets the motor
-coast without pulses, and gives no feedback of the motor.
+coast without pulses, and gives no motor feedback.
 """
 
 import math
@@ -16,10 +16,10 @@ class EscEmulator:
     """Speed controller with its motor.
 
     Args:
-        esc: settings of its pulses.
+        esc: pulse settings.
         clock: time.
         plant: the motor.
-        pulse: pulse width at its input at a time (ns), us; None without pulses.
+        pulse: returns the pulse width at the input (us) at a time (ns); None without pulses.
     """
 
     def __init__(self, esc: EscPulses, clock: Clock, plant: MotorPlant, pulse: Callable[[int], float | None]) -> None:

@@ -1,4 +1,4 @@
-"""Table of the faults of an emulated device."""
+"""Table of an emulated device's faults."""
 
 from collections.abc import Callable, Mapping
 
@@ -11,12 +11,12 @@ FaultRows = Mapping[str, Callable[..., None] | float]
 class FaultTable:
     """Faults of one device.
 
-    The value of a row starts the fault: a function, which receives the values as text, and ``on|off`` as a bool; or a
-    number, which the table keeps and the device reads. A ``False`` is a switch, an ``int`` is the number of remaining
+    The value of a row starts the fault: either a function, which receives its values as text (``on|off`` as a bool), or
+    a number, which the table keeps and the device reads. A ``False`` is a switch, an ``int`` is the number of remaining
     occurrences, a ``float`` is a quantity.
 
     Args:
-        device: name of the device, for messages.
+        device: device name for messages.
         rows: faults of the device.
 
     Raises:
@@ -48,11 +48,11 @@ class FaultTable:
                     self._numbers[fault] = value
 
     def __getitem__(self, fault: str) -> float:
-        """Return the number of a fault that the table keeps."""
+        """Return the number kept for a fault."""
         return self._numbers[fault]
 
     def __setitem__(self, fault: str, number: float) -> None:
-        """Set the number of a fault that the table keeps."""
+        """Set the number kept for a fault."""
         self._numbers[fault] = number
 
     def strikes(self, fault: str) -> bool:
@@ -89,7 +89,7 @@ class LateAnswers:
         self._delays: list[float] = []
 
     def start(self, seconds: str, count: str = "1") -> None:
-        """Delay the next ``count`` answers."""
+        """Delay the next ``count`` answers by ``seconds``."""
         self._delays = [float(seconds)] * int(count)
 
     def take(self, usual: float) -> float:
@@ -98,12 +98,12 @@ class LateAnswers:
 
 
 class FaultyDevice:
-    """Base of the emulators, with the faults of its table."""
+    """Base class of the emulators; injects the faults in its table."""
 
     faults: FaultTable
 
     def inject(self, fault: str, *values: str) -> None:
-        """Start or end a fault; the class lists them.
+        """Start or end a fault; the class docstring lists the faults.
 
         Raises:
             InputError: the device has no such fault, or the values do not fit it.

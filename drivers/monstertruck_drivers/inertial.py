@@ -1,4 +1,4 @@
-"""Correction shared by drivers of inertial measurement units: removal of biases and scale."""
+"""Correction shared by the IMU drivers: removes biases and scale errors."""
 
 from collections.abc import Sequence
 from typing import Annotated
@@ -29,18 +29,18 @@ class ImuCorrection(Schema):
 
 
 def mean(vectors: Sequence[Xyz]) -> Xyz:
-    """Return the mean of vectors, component by component."""
+    """Return the component-wise mean of vectors."""
     x, y, z = (sum(axis) / len(vectors) for axis in zip(*vectors, strict=True))
     return x, y, z
 
 
 def corrected_rate(rate: Xyz, by: ImuCorrection) -> Vector3:
-    """Angular velocity without its biases (rad/s)."""
+    """Angular velocity corrected for bias (rad/s)."""
     x, y, z = rate
     return Vector3(x=x - by.rate_x, y=y - by.rate_y, z=(z - by.rate_z) * by.rate_scale)
 
 
 def corrected_force(force: Xyz, by: ImuCorrection) -> Vector3:
-    """Specific force without its biases (m/s^2)."""
+    """Specific force corrected for bias (m/s^2)."""
     x, y, z = force
     return Vector3(x=x - by.force_x, y=y - by.force_y, z=z)

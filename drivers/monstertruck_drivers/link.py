@@ -1,7 +1,7 @@
-"""Byte links, with one receive buffer and one state for the loss of the peer.
+"""Byte links, with one receive buffer and one state for losing the peer.
 
-A device is plugged into a ``Port``; opening the port returns a ``Link``. Its users need not know whether the bytes come
-from a tty, a pty or another coroutine.
+A device is plugged into a ``Port``; opening the port returns a ``Link``. Users of a link need not know whether its
+bytes come from a tty, a pty or another coroutine.
 """
 
 import asyncio
@@ -24,10 +24,10 @@ class Link:
     """One open connection: buffered reads, immediate writes, one ``lost`` state.
 
     Args:
-        name: for error messages.
+        name: name for error messages.
         transmit: sends bytes to the peer.
         hang_up: closes the underlying transport; called once.
-        baud: baud rate of the line (bit/s); None if it has none.
+        baud: baud rate (bit/s); None if the line has none.
         limit: maximum number of unread bytes.
     """
 
@@ -81,7 +81,7 @@ class Link:
 
     @property
     def is_lost(self) -> bool:
-        """True once the peer is gone or the link was closed."""
+        """Whether the peer is gone or the link was closed."""
         return self._lost is not None
 
     def write(self, data: bytes) -> None:
@@ -97,11 +97,11 @@ class Link:
         """Return all bytes received so far.
 
         Args:
-            within: maximum wait (s); None: no limit.
+            within: maximum wait (s); None for no limit.
             least: minimum number of bytes to wait for.
 
         Raises:
-            DeviceLostError: the link is down and its buffer holds less.
+            DeviceLostError: the link is down and its buffer holds fewer than ``least`` bytes.
             TimeoutError: fewer bytes arrived in time.
         """
         if len(self._buffer) < least:
@@ -113,15 +113,15 @@ class Link:
         return data
 
     async def exactly(self, count: int, within: float | None = None) -> bytes:
-        """Read ``count`` bytes; further bytes stay buffered.
+        """Read ``count`` bytes; further bytes remain buffered.
 
         Args:
             count: number of bytes.
-            within: maximum wait for the last one (s); None: no limit.
+            within: maximum wait for the last byte (s); None for no limit.
 
         Raises:
-            DeviceLostError: the link went down before they arrived.
-            TimeoutError: they did not arrive in time; those that did stay buffered.
+            DeviceLostError: the link went down before all bytes arrived.
+            TimeoutError: not all bytes arrived in time; those received remain buffered.
         """
         if len(self._buffer) < count:
             due = _due(within)
@@ -132,10 +132,10 @@ class Link:
         return data
 
     def take(self, count: int) -> bytes | None:
-        """Take ``count`` received bytes; None if fewer are buffered.
+        """Remove and return ``count`` received bytes; None if fewer are buffered.
 
         Raises:
-            DeviceLostError: fewer are buffered, and the link is down.
+            DeviceLostError: fewer bytes are buffered and the link is down.
         """
         if len(self._buffer) < count:
             self._require_up()
@@ -145,13 +145,13 @@ class Link:
         return data
 
     def discard(self) -> int:
-        """Discard received bytes that were not read; return their number."""
+        """Discard unread bytes; return their number."""
         count = len(self._buffer)
         self._buffer.clear()
         return count
 
     def close(self) -> None:
-        """Close the link at once and drop unsent bytes; may be called repeatedly."""
+        """Close the link immediately and drop unsent bytes; may be called repeatedly."""
         if self._hang_up is not _nothing:
             hang_up, self._hang_up = self._hang_up, _nothing
             hang_up()
@@ -164,9 +164,9 @@ class Link:
         self.close()
 
     def begin_wait(self, waiting: "LinkWaiter", due: float | None) -> None:
-        """Wake ``waiting`` at the next bytes or the loss of the link, or by a timeout at ``due`` (loop time).
+        """Wake ``waiting`` when bytes arrive, when the link is lost, or at ``due`` (loop time).
 
-        One timer serves many waits; it is set again only when it fires.
+        One timer serves many waits; it is rescheduled only when it fires.
 
         Raises:
             RuntimeError: a task is already waiting.
@@ -178,7 +178,7 @@ class Link:
             self._set_alarm(asyncio.get_running_loop(), due)
 
     def end_wait(self) -> None:
-        """Stop notifying."""
+        """Stop notifying the waiter."""
         self._waiting = self._due = None
 
     async def _more(self, due: float | None = None, count: int = 1) -> None:
@@ -212,13 +212,13 @@ class Link:
 
 
 class LinkWaiter(Protocol):
-    """Waits for bytes of a link."""
+    """Waits for bytes from a link."""
 
     def on_bytes(self) -> None:
         """Handle received bytes or the loss of the link."""
 
     def on_timeout(self) -> None:
-        """Handle the timeout of the wait."""
+        """Handle the end of the wait by timeout."""
 
 
 class _Sleeper:
@@ -250,7 +250,7 @@ def _due(within: float | None) -> float | None:
 
 
 class Port(Protocol):
-    """Port that a device may be plugged into."""
+    """A port that a device may be plugged into."""
 
     name: str
 
@@ -259,6 +259,6 @@ class Port(Protocol):
 
         Raises:
             DeviceLostError: nothing is plugged in.
-            DeviceWedgedError: the kernel does not finish opening or closing it.
-            PortBusyError: another process holds it.
+            DeviceWedgedError: the kernel does not finish opening or closing the port.
+            PortBusyError: another process holds the port.
         """

@@ -1,7 +1,7 @@
-"""Base of the drivers that command all shafts of one board in one exchange per cycle.
+"""Base class of the drivers that command all shafts of one board in one exchange per cycle.
 
-The shafts share one state: the most cautious of their commands and the oldest one decide. A stop is sent at once, any
-other command with the next cycle.
+The shafts share one state, set by their most cautious command and the age of the oldest one. A stop is sent
+immediately, and any other command in the next cycle.
 """
 
 from abc import ABC, abstractmethod
@@ -17,7 +17,7 @@ from monstertruck_schemas.sensor import DriveFeedback, DriveMode
 
 
 class MotorSettings(Protocol):
-    """Settings of a driver that the base reads."""
+    """Driver settings that the base class reads."""
 
     @property
     def rate(self) -> float:
@@ -49,12 +49,12 @@ def requested(
     """Combine the latest commands of all shafts into one state.
 
     Args:
-        commands: latest command of each shaft, if any.
-        now: time (ns).
+        commands: latest command for each shaft, if any.
+        now: current time (ns).
         timeout: maximum age of a command (s); an older one stops the motors.
 
     Returns:
-        DISABLED, QUICK_STOP or ENABLED, and the existing commands: with ENABLED one for each shaft.
+        DISABLED, QUICK_STOP or ENABLED, and the existing commands; if ENABLED, one for each shaft.
     """
     known = [command for command in commands if command is not None]
     if len(known) < len(commands) or any(command.action is DriveAction.DISABLE for command in known):
@@ -66,16 +66,16 @@ def requested(
 
 
 class MotorBoard(ABC, Generic[Settings, Session]):
-    """Service of the motors on one board.
+    """Drive service for the motors on one board.
 
     Args:
-        config: settings of the driver.
-        port: port of the board.
+        config: driver settings.
+        port: the board's port.
         clock: time.
         shafts: number of driven shafts.
-        events: identity, restarts, faults.
-        name: name of the service.
-        ends: topics of the shafts.
+        events: identity, restarts and faults.
+        name: service name.
+        ends: the shafts' topics.
     """
 
     def __init__(
@@ -99,10 +99,10 @@ class MotorBoard(ABC, Generic[Settings, Session]):
         """State last requested from the board."""
 
     async def run(self, ready: Ready) -> None:
-        """Serve one session; it stops the motors at its start, as they may still turn, and at its end.
+        """Serve one session. The motors are stopped at its start, because they may still be turning, and at its end.
 
         Raises:
-            DeviceLostError: nothing plugged in; the link went down.
+            DeviceLostError: no board is plugged in, or the link went down.
             PortBusyError: another process holds the port.
             DeviceTimeoutError, ProtocolError: no usable answers.
             DeviceError: see ``_start`` and ``_exchange`` of the driver.
@@ -134,7 +134,7 @@ class MotorBoard(ABC, Generic[Settings, Session]):
         return [commands.latest for commands in self._commands]
 
     def _is_urgent(self) -> bool:
-        """Whether a stop, or a switch-off of the current, still has to be sent to the motors."""
+        """Whether a stop or a power-off still has to be sent to the motors."""
         wanted = self._wanted()
         return wanted is not DriveMode.ENABLED and wanted is not self._sent
 
@@ -147,7 +147,7 @@ class MotorBoard(ABC, Generic[Settings, Session]):
 
     @abstractmethod
     def _session(self, link: Link) -> Session:
-        """Create the session of an open link."""
+        """Create the session for an open link."""
 
     @abstractmethod
     async def _start(self, session: Session) -> None:
@@ -159,7 +159,7 @@ class MotorBoard(ABC, Generic[Settings, Session]):
 
     @abstractmethod
     async def _exchange(self, session: Session) -> None:
-        """Send the set-points, set ``_sent``, and publish the answer of the board."""
+        """Send the set-points, set ``_sent``, and publish the board's answer."""
 
     @abstractmethod
     async def _make_safe(self, session: Session) -> None:

@@ -1,4 +1,4 @@
-"""Settings of pulse-controlled servos and speed controllers, for any controller."""
+"""Settings for pulse-controlled servos and speed controllers, whatever device sends the pulses."""
 
 import math
 from typing import Annotated, Literal, Self
@@ -34,19 +34,19 @@ class ServoPulses(Schema):
         return self
 
     def pulse_us(self, angle: float) -> float:
-        """Pulse (us) for a servo angle (rad, left positive), clamped to all limits."""
+        """Pulse (us) for a servo angle (rad, left positive), clamped to every limit."""
         limit = self.max_angle_deg
         degrees = min(max(math.degrees(angle), -limit), limit)
         pulse = self.centre_us + self.direction * self.scale_us_per_deg * degrees
         return min(max(pulse, self.min_us), self.max_us)
 
     def angle_of(self, pulse_us: float) -> float:
-        """Servo angle (rad, left positive) of a pulse (us)."""
+        """Servo angle (rad, left positive) for a pulse (us)."""
         return math.radians((pulse_us - self.centre_us) * self.direction / self.scale_us_per_deg)
 
     @property
     def reach(self) -> tuple[float, float]:
-        """Servo angles (rad) at the pulse limits: to the right (negative) and to the left."""
+        """Servo angles (rad) at the pulse limits: right (negative) and left."""
         ends = sorted(self.angle_of(pulse) for pulse in (self.min_us, self.max_us))
         limit = math.radians(self.max_angle_deg)
         return max(ends[0], -limit), min(ends[1], limit)
@@ -55,8 +55,7 @@ class ServoPulses(Schema):
 class EscPulses(Schema):
     """Speed controller without feedback: ``pulse_us = neutral_us + direction * reach_us * rate / max_rate``.
 
-    It must reverse without braking first (crawler mode); the usual mode of a car treats the first reverse pulse as a
-    brake.
+    It must reverse without braking first (crawler mode); the usual car mode treats the first reverse pulse as a brake.
     """
 
     neutral_us: Microseconds = 1500.0

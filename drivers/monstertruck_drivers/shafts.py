@@ -1,10 +1,10 @@
-"""Properties of a drive or steering controller that the daemon needs, for any kind."""
+"""Properties that the daemon needs from any kind of drive or steering controller."""
 
 from typing import Any, NamedTuple
 
 
 class MotorLimits(NamedTuple):
-    """Limits of a motor at its shaft; ``motor_limits`` of a drive's settings."""
+    """Limits of a motor at its shaft; the value of ``motor_limits`` in a drive's settings."""
 
     rate: float
     """Maximum rate (rad/s)."""
@@ -21,7 +21,7 @@ def motor_limits(settings: Any) -> MotorLimits | None:
 
 
 class SteeringOutputs(NamedTuple):
-    """Steering outputs of a controller; ``steering_outputs`` of its settings."""
+    """Steering outputs of a controller; the value of ``steering_outputs`` in its settings."""
 
     reaches: tuple[tuple[float, float], ...]
     """Maximum angles of every servo, in the order of ``SteeringCommand`` (rad): to the right (negative) and to the
@@ -34,17 +34,17 @@ class SteeringOutputs(NamedTuple):
 
     @property
     def axles(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Reach of the front and the rear axle; of their left servos if every wheel has a servo."""
+        """Reach of the front and rear axles, or of their left servos if every wheel has a servo."""
         return self.reaches[0], self.reaches[len(self.reaches) // 2]
 
 
 def steering_outputs(settings: Any) -> SteeringOutputs | None:
-    """Return the steering outputs of a device; None if it steers nothing."""
+    """Return a device's steering outputs; None if it does not steer."""
     outputs: SteeringOutputs | None = getattr(settings, "steering_outputs", None)
     return outputs
 
 
 def stop_words(settings: Any) -> str | None:
-    """Return the stop script's arguments besides kind, port and baud rate; None if it cannot stop the kind."""
+    """Return the stop script's arguments besides kind, port and baud rate; None if the script cannot stop this kind."""
     words: str | None = getattr(settings, "stop_words", None)
     return words

@@ -1,6 +1,6 @@
 """Signals of an emulated device: the values it reports, the commands it executes, and the faults that falsify them.
 
-An emulator names its signals once and passes each value through ``report`` or ``order``; every fault of this module
+An emulator names its signals once and passes each value through ``report`` or ``order``; every fault in this module
 then applies to every signal. Tests and drills derive their fault families from ``Signals.faults``.
 """
 
@@ -46,8 +46,8 @@ class Context:
 
     Args:
         newest: latest true value of the signal; None before the first one.
-        neighbour: returns the last true value of the next signal of the same kind, None if it had none.
-        rng: randomness.
+        neighbour: returns the last true value of the next signal of the same kind; None if it has had none.
+        rng: random generator.
     """
 
     newest: Any
@@ -63,7 +63,7 @@ Distortion = Callable[[Any, int], Any]
 
 
 def _like(original: Any, result: Any) -> Any:
-    """Return ``result`` in the type of ``original``: whole numbers stay whole."""
+    """Return ``result`` in the type of ``original``: integers remain integers."""
     if isinstance(original, np.ndarray):
         whole = np.issubdtype(original.dtype, np.integer)
         return (np.rint(result) if whole else result).astype(original.dtype)
@@ -192,7 +192,7 @@ def _growing(context: Context) -> Distortion:
 
 @dataclass(frozen=True, slots=True)
 class _Later:
-    """Command that is executed later."""
+    """A command that is executed later."""
 
     seconds: float
 
@@ -203,7 +203,7 @@ def _late(_: Context, seconds: float) -> Distortion:
 
 @dataclass(frozen=True, slots=True)
 class SignalFault:
-    """Fault that falsifies signals.
+    """A fault that falsifies signals.
 
     Args:
         make: builds the distortion from its context and, if it has one, its argument.
@@ -248,11 +248,10 @@ class Signals:
     """The signals of one device.
 
     Args:
-        now: returns the time (ns).
+        now: returns the current time (ns).
         kinds: kinds of the signals by name; their order defines the neighbours.
-        rng: the device's randomness; the faults' randomness is spawned from it.
-        codes: minimum of the measured values, by array; lower values are codes, which arithmetic faults do not
-            change.
+        rng: the device's random generator, from which the faults' generators are spawned.
+        codes: minimum measured value by array name; lower values are codes, which arithmetic faults do not change.
 
     Raises:
         InputError: a kind is not a ``SignalKind``.
@@ -287,7 +286,7 @@ class Signals:
                     yield name, fault
 
     def used(self, name: str) -> bool:
-        """Return whether the host has ever read the value or given the command."""
+        """Whether the host has ever read the value or sent the command."""
         return name in self._newest
 
     def extent(self, name: str) -> float:
@@ -296,10 +295,10 @@ class Signals:
         return float(np.abs(newest).max()) if isinstance(newest, np.ndarray) else self._greatest.get(name, 0.0)
 
     def inject(self, name: str, fault: str, *values: str) -> None:
-        """Add a fault to a signal, or with ``off`` end all of them.
+        """Add a fault to a signal; ``off`` ends all faults of the signal.
 
         Raises:
-            InputError: the signal or the fault is unknown, or the argument cannot be read.
+            InputError: the signal or the fault is unknown, or the argument is invalid.
         """
         if name not in self.kinds:
             raise InputError(f"signal {name!r}: expected one of {', '.join(self.kinds)}")
@@ -361,7 +360,7 @@ class Signals:
             self._greatest[name] = max(self._greatest.get(name, 0.0), abs(value))
 
     def _neighbour(self, name: str) -> str | None:
-        """Return the next signal of the same kind, None if there is no other."""
+        """Return the next signal of the same kind; None if there is no other."""
         alike = [other for other, kind in self.kinds.items() if kind is self.kinds[name]]
         following = alike[(alike.index(name) + 1) % len(alike)]
         return None if following == name else following

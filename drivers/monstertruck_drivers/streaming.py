@@ -11,7 +11,7 @@ T = TypeVar("T")
 
 
 class DeviceStream(Generic[T]):
-    """Messages of one session.
+    """Message stream of one session.
 
     Args:
         link: open link.
@@ -33,11 +33,11 @@ class DeviceStream(Generic[T]):
         """Return the messages completed by the next bytes, possibly none.
 
         Args:
-            within: maximum wait for the bytes (s); None: no limit.
+            within: maximum wait for the bytes (s); None for no limit.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: silence.
+            DeviceLostError: the device was unplugged.
+            DeviceTimeoutError: the device is silent.
         """
         try:
             data = await self._link.read(within, least=self._batch)
@@ -54,9 +54,9 @@ class DeviceStream(Generic[T]):
             within: maximum wait for a message (s).
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: silence.
-            ProtocolError: bytes, but no message.
+            DeviceLostError: the device was unplugged.
+            DeviceTimeoutError: the device is silent.
+            ProtocolError: bytes arrive, but no complete message.
         """
         heard, name = self.bytes_heard, self._link.name
         until = self._clock.now() + round(within * SECOND)
@@ -78,12 +78,12 @@ class DeviceStream(Generic[T]):
 
         Args:
             within: maximum wait for a message (s).
-            expected: end of the text of a ``WrongDeviceError``: the expected device and likely causes.
+            expected: text that ends the message of a ``WrongDeviceError``: the expected device and likely causes.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: silence.
-            WrongDeviceError: bytes, but no message.
+            DeviceLostError: the device was unplugged.
+            DeviceTimeoutError: the device is silent.
+            WrongDeviceError: bytes arrive, but no complete message.
         """
         try:
             return await self.receive(within)

@@ -14,13 +14,13 @@ CONNECT_TIMEOUT: Final = 2.0
 
 
 def parse_address(text: str) -> tuple[str, int] | None:
-    """Parse address and TCP port of ``192.168.0.10:10940``; None if the text is not an address."""
+    """Parse an address and TCP port such as ``192.168.0.10:10940``; None if the text has another form."""
     found = re.fullmatch(r"(\d{1,3}(?:\.\d{1,3}){3}):(\d{1,5})", text)
     return None if found is None else (found[1], int(found[2]))
 
 
 class TcpPort:
-    """A socket by its IPv4 address, which needs no name look-up, so that nothing blocks.
+    """A TCP socket at an IPv4 address; without a name look-up, connecting does not block.
 
     Args:
         address: IPv4 address.
@@ -32,10 +32,10 @@ class TcpPort:
         self._address, self._number = address, number
 
     async def open(self) -> Link:
-        """Connect.
+        """Open a connection.
 
         Raises:
-            DeviceLostError: no route, no answer, or refused.
+            DeviceLostError: there is no route or no answer, or the connection is refused.
         """
         try:
             async with asyncio.timeout(CONNECT_TIMEOUT):

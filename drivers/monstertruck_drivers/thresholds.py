@@ -1,4 +1,4 @@
-"""Thresholds with hysteresis and dwell time, for conditions that must last and levels that need a margin to end."""
+"""Thresholds with hysteresis and dwell time: a condition must last, and a level needs a margin to end."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ from monstertruck_runtime.clock import SECOND
 
 
 class Dwell:
-    """Becomes True when a condition has held for some seconds without a break."""
+    """Becomes True once a condition has held for some seconds without interruption."""
 
     def __init__(self, seconds: float) -> None:
         self._needed = round(seconds * SECOND)
@@ -24,7 +24,7 @@ class Dwell:
 
 @dataclass(frozen=True, slots=True)
 class Threshold:
-    """Limits of an alarm; ``clear < set`` detects values that are too high, ``clear > set`` values that are too low."""
+    """Alarm limits; ``clear < set`` detects values that are too high, ``clear > set`` values that are too low."""
 
     set: float
     clear: float
@@ -45,7 +45,7 @@ class ThresholdAlarm:
         self.active = False
 
     def update(self, time_ns: int, value: float | None) -> bool:
-        """Process the value at ``time_ns``; None changes nothing. Return whether the alarm changed."""
+        """Process the value at ``time_ns``; None leaves the alarm unchanged. Return whether the alarm changed."""
         if value is None:
             return False
         limits = self._threshold

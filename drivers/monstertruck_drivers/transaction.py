@@ -19,10 +19,10 @@ MISSES: Final = 3
 
 
 class Misses:
-    """Context for consecutive exchanges: suppresses errors of the answer, except the last of ``limit`` in a row.
+    """Context for consecutive exchanges: suppresses answer errors until ``limit`` occur in a row.
 
     Args:
-        limit: maximum number of consecutive exchanges without a usable answer; then the session ends.
+        limit: number of consecutive exchanges without a usable answer that ends the session.
     """
 
     def __init__(self, limit: int = MISSES) -> None:
@@ -42,7 +42,7 @@ class Misses:
 
 
 class WaitFor(NamedTuple):
-    """Wait condition of a transaction: ``size`` bytes within a time in seconds; with size 0, the time alone."""
+    """Wait condition of a transaction: ``size`` bytes within a time (s); if the size is 0, only the time."""
 
     size: int
     within: float
@@ -53,7 +53,7 @@ Steps = Generator[WaitFor, bytes, T]
 
 
 class Transaction(Generic[T]):
-    """One transaction; it starts at once and runs to its end, whether or not a task waits for it.
+    """One transaction; it starts immediately and runs to its end, whether or not a task waits for it.
 
     Args:
         link: link whose only reader is this transaction until it ends.
@@ -76,7 +76,7 @@ class Transaction(Generic[T]):
         """Wait for the end; a cancelled wait does not end the transaction.
 
         Raises:
-            Exception: exception raised by the transaction.
+            Exception: the exception raised by the transaction.
         """
         await self.end()
         if self._error is not None:
@@ -127,7 +127,7 @@ class Transaction(Generic[T]):
 
     @contextmanager
     def _ending_by_any_error(self) -> Iterator[None]:
-        """End on an exception outside ``Exception``, which a signal may raise anywhere: waiting tasks must not hang."""
+        """End the transaction on exceptions outside ``Exception``, which a signal may raise: waiters must not hang."""
         try:
             yield
         except BaseException as error:

@@ -1,7 +1,8 @@
-"""Serial ports of the kernel, opened and closed in separate threads.
+"""Kernel serial ports, opened and closed in separate threads.
 
-Both may block on the device: opening makes several USB transfers, each of up to 5 s if the device does not answer;
-closing waits 30 s for a device that accepts no bytes. Only reading and writing run on the event loop.
+Both operations may block on the device: opening makes several USB transfers, each of which takes up to 5 s if the
+device does not answer; closing waits 30 s for a device that accepts no bytes. Only reading and writing run on the event
+loop.
 """
 
 import asyncio
@@ -39,7 +40,7 @@ _PTY_MAJORS: Final = range(136, 144)
 
 
 class OpenSerial(Protocol):
-    """Factory of the port of a serial node: ``SerialPort``, or that of an emulated computer."""
+    """Factory for the port at a serial node: ``SerialPort``, or the port of an emulated computer."""
 
     def __call__(
         self,
@@ -55,15 +56,15 @@ class OpenSerial(Protocol):
 
 
 class SerialPort:
-    """A tty by its path (``/dev/truck/lidar``, ``/dev/serial/by-path/...``, a pty).
+    """A tty at a path (``/dev/truck/lidar``, ``/dev/serial/by-path/...``, a pty).
 
     Args:
-        path: device node or a symlink to it; resolved again at every open.
+        path: device node or a symlink to it; the symlink is resolved at every open.
         baud: bits per second; meaningless on USB-CDC and ptys.
-        dtr: level of the line DTR while the port is open; the kernel itself raises both lines for a moment on opening.
-        rts: level of the line RTS while the port is open.
-        low_latency: ask the adapter's driver not to collect bytes.
-        framing: format of a byte.
+        dtr: level of the DTR line while the port is open; the kernel itself briefly raises DTR and RTS on opening.
+        rts: level of the RTS line while the port is open.
+        low_latency: whether to ask the adapter's driver not to buffer received bytes.
+        framing: data bits, parity and stop bits.
     """
 
     def __init__(
@@ -81,11 +82,11 @@ class SerialPort:
         self._make = partial(_Tty, str(path), baud, dtr=dtr, rts=rts, low_latency=low_latency, framing=framing)
 
     async def open(self) -> Link:
-        """Open the port raw and exclusive, with empty buffers; wait for a link of this process that is closing.
+        """Open the port raw and exclusive, with empty buffers; first wait for a closing link of this process.
 
         Raises:
             DeviceLostError: the node does not exist or vanished.
-            DeviceWedgedError: the kernel does not finish opening it, or closing it after an earlier use.
+            DeviceWedgedError: the kernel does not finish opening the port, or closing it after earlier use.
             PortBusyError: another process holds it.
         """
         if not self._path.exists():
@@ -95,7 +96,7 @@ class SerialPort:
         return _SerialProtocol(self.name, tty).link
 
     def _open(self, node: "_PortNode") -> "_Tty":
-        """Open the port in this thread; raises the errors of ``open``."""
+        """Open the port in this thread; raises the same errors as ``open``."""
         try:
             return self._make(node=node)
         except serial.SerialException as error:
@@ -128,7 +129,7 @@ def _await_last_words() -> None:
 
 
 class _PortNode:
-    """One device node of the kernel; its opens and closes run one at a time.
+    """One kernel device node; its opens and closes run one at a time.
 
     A node that the kernel does not release occupies one thread; the device gets another node when it is enumerated
     again.
@@ -140,15 +141,15 @@ class _PortNode:
         """Work that has exceeded its time limit."""
 
     async def open(self, name: str, make: "Callable[[], _Tty]") -> "_Tty":
-        """Run ``make`` in a thread, which also closes a tty that is too late or whose caller was cancelled.
+        """Run ``make`` in a thread, which closes the tty again if it opened too late or the caller was cancelled.
 
         Args:
             name: name of the port, for error messages.
             make: opens the tty.
 
         Raises:
-            DeviceWedgedError: it has not returned after ``PATIENCE``, or earlier work of this node has not ended.
-            Exception: exception raised by ``make``.
+            DeviceWedgedError: ``make`` has not returned after ``PATIENCE``, or earlier work on this node has not ended.
+            Exception: the exception raised by ``make``.
         """
         await self._previous_work(name)
         outcome: Future[_Tty] = Future()
@@ -210,7 +211,7 @@ def _node(path: Path) -> _PortNode:
 
 
 def _start(work: Callable[[], None], ended: Future[None]) -> None:
-    """Do blocking work in a thread that the end of the process does not wait for."""
+    """Do blocking work in a thread that the process does not wait for when it exits."""
 
     def run() -> None:
         try:
@@ -236,7 +237,7 @@ async def _ended(work: "Future[Any]", seconds: float) -> None:
 
 
 class _Tty(serial.Serial):
-    """Pyserial's port, which is closed in a thread and never drained. Must be created in a thread.
+    """A pyserial port that is closed in a thread and never drained. It must be created in a thread.
 
     Args:
         path: device node.
@@ -279,7 +280,7 @@ class _Tty(serial.Serial):
                 self.set_low_latency_mode(True)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Skip a timeout that is already set: pyserial would configure the open port again, by USB transfers."""
+        """Skip a timeout that is already set: pyserial would reconfigure the open port, which takes USB transfers."""
         if not (name in ("timeout", "write_timeout") and self.is_open and value == getattr(self, name)):
             super().__setattr__(name, value)
 
@@ -308,7 +309,7 @@ class _Tty(serial.Serial):
             return 0
 
     def flush(self) -> None:
-        """Do nothing: pyserial would wait for the device without a limit."""
+        """Do nothing: pyserial would wait for the device indefinitely."""
 
     def begin_closing(self) -> None:
         """Make later opens of the node wait until this port is closed."""
@@ -354,7 +355,7 @@ class _SerialProtocol(asyncio.Protocol):
         self.link = Link(name, self._send, self._hang_up, tty.baudrate)
 
     def _send(self, data: bytes) -> None:
-        """Write at once: a last command before ``close`` must not remain in a buffer that ``abort`` drops."""
+        """Write immediately: a last command before ``close`` must not remain in a buffer that ``abort`` drops."""
         if self._transport.is_closing():
             return
         now, untaken = self._loop.time(), self._tty.untaken()
@@ -380,7 +381,7 @@ class _SerialProtocol(asyncio.Protocol):
         self._untaken = self._tty.untaken()
 
     def _check_age(self) -> None:
-        """Close the port if its line has been full for too long.
+        """Close the port if its transmit buffer has been full for too long.
 
         This also applies after a read error, when the transport tries to send its remaining bytes before it ends.
         """

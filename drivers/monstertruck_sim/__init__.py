@@ -1,1 +1,1 @@
-"""Simulated world, with an emulated robot and computer in it, behind the cables."""
+"""Simulated world with an emulated robot and computer."""

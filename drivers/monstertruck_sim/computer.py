@@ -1,4 +1,4 @@
-"""Emulated computer of a simulated truck: hubs, ports and nodes with the names in its configuration."""
+"""Emulated computer of a simulated truck: hubs, ports and nodes with the names from its configuration."""
 
 import asyncio
 from collections.abc import Iterable, Mapping
@@ -56,7 +56,7 @@ class UsbCable:
 
 
 def _buses(ports: Iterable[AnyPort]) -> dict[str, int]:
-    """Choose bus numbers that no kernel name uses, for the controllers in names by topology."""
+    """Choose bus numbers that no kernel name uses for the controllers in topology names."""
     hubs = [port.hub for port in ports if isinstance(port, UsbPortConfig)]
     controllers = sorted({hub.rpartition("-usb-0:")[0] for hub in hubs if is_topology(hub)})
     taken = {sort_key(hub)[0] for hub in hubs if not is_topology(hub)}
@@ -73,7 +73,7 @@ def _by_kernel(port: UsbPortConfig, buses: Mapping[str, int]) -> UsbPortConfig:
 
 
 class EmulatedComputer:
-    """USB tree with every device that is configured by hub and port.
+    """USB tree with all devices that are configured by hub and port.
 
     Args:
         folder: existing folder that receives proc, sys and dev.
@@ -117,7 +117,7 @@ class EmulatedComputer:
         return Computer(self.usb.machine(self._clock), self.folder, lambda: self.usb.watcher, lambda _: DISK)
 
     def command(self, words: list[str]) -> None:
-        """Execute a command on the USB tree, see ``HELP``; the return of a hub takes some time.
+        """Execute a command on the USB tree (see ``HELP``); the return of a hub takes some time.
 
         Raises:
             InputError: the command or the place is unknown.

@@ -10,7 +10,7 @@ from monstertruck_sim.world.config import CameraConfig, HeldBoard, WorldConfig
 
 
 class DrillConfig(Schema):
-    """Random faults while a simulated truck runs."""
+    """Random faults injected while a simulated truck runs."""
 
     seed: Annotated[int, Field(ge=0)] = 1
     """Seed of the faults and their times"""
@@ -19,7 +19,7 @@ class DrillConfig(Schema):
 
 
 class CeilingCamera(CameraConfig):
-    """Rendered camera of the stand, fixed in the map and looking down; engine mujoco only."""
+    """Rendered camera of the test stand, fixed in the map and looking down; available only with engine mujoco."""
 
     port: Path
     """Symbolic link created for the camera; the stand's camera of kind `rendered` uses the same one"""
@@ -50,7 +50,7 @@ class StandConfig(Schema):
 
 
 class SimConfig(Schema):
-    """Settings of the simulation."""
+    """Simulation settings."""
 
     seed: Annotated[int, Field(ge=0)] = 1
     """Seed of all random values"""

@@ -1,4 +1,4 @@
-"""Console commands of emulated devices: from standard input of an emulator process, from tests, from drills."""
+"""Console commands for emulated devices, from the standard input of an emulator process, from tests or from drills."""
 
 import asyncio
 import os
@@ -28,7 +28,7 @@ class Commanded(Protocol):
         """Execute one command.
 
         Raises:
-            InputError: the command is unknown; the text lists the known ones.
+            InputError: the command is unknown; the message lists the known commands.
         """
 
 
@@ -43,7 +43,7 @@ class Emulated:
         """Execute one command.
 
         Raises:
-            InputError: the command is unknown; the text lists the known ones.
+            InputError: the command is unknown; the message lists the known commands.
         """
         match words:
             case ["plug"]:
@@ -76,7 +76,7 @@ class EmulatedFiles:
         """Execute one command.
 
         Raises:
-            InputError: the command is unknown; the text lists the known ones.
+            InputError: the command is unknown; the message lists the known commands.
         """
         match words or ["help"]:
             case ["signal", *rest]:
@@ -86,7 +86,7 @@ class EmulatedFiles:
 
 
 def set_signal_fault(emulator: object, words: list[str]) -> None:
-    """Falsify a signal of an emulator from the words NAME FAULT [VALUE].
+    """Falsify an emulator's signal as given by the words NAME FAULT [VALUE].
 
     Raises:
         InputError: the emulator declares no signals, or the signal or fault is unknown.
@@ -100,10 +100,10 @@ def set_signal_fault(emulator: object, words: list[str]) -> None:
 
 
 def set_line_fault(faults: LineFaults, name: str, value: str) -> None:
-    """Set one fault of the cable from text.
+    """Set one cable fault from text.
 
     Raises:
-        InputError: unknown fault or bad value.
+        InputError: the fault is unknown or its value is invalid.
     """
     try:
         match name:
@@ -159,7 +159,7 @@ class FaultConsole:
     async def run(self) -> None:
         """Execute lines until cancelled; the end of the input ends the commands, not the devices.
 
-        A background process of a terminal receives no lines: its reads fail instead of stopping it.
+        A background process on a terminal receives no lines: its reads fail instead of stopping the process.
         """
         if not _pollable(self._source):
             await asyncio.Event().wait()
@@ -181,7 +181,7 @@ class FaultConsole:
         await asyncio.Event().wait()
 
     def execute(self, line: str) -> None:
-        """Execute one line; prints ``ok`` or an error, or the commands if the last word is ``help``."""
+        """Execute one line; print ``ok`` or an error, or the list of commands if the last word is ``help``."""
         words = line.split()
         if not words:
             return
@@ -194,7 +194,7 @@ class FaultConsole:
 
 
 def _read(source: int) -> bytes:
-    """Return the text written since the last call, at least one line; empty without a terminal to read from."""
+    """Return the text written since the last call, at least one line; empty if there is no terminal to read from."""
     try:
         return os.read(source, 65536)
     except OSError:

@@ -1,7 +1,7 @@
-"""Fault families generated from the emulated devices' own signals: one family for each way to falsify a signal.
+"""Fault families generated from the emulated devices' own signals: one family for each way of falsifying a signal.
 
-The catalog in ``faults`` lists known faults. This module lists none: it derives the families from the signals that
-devices declare, including those of plug-ins.
+The catalog in ``faults`` lists known faults. This module lists no faults: it derives families from the signals that
+devices declare, including devices from plug-ins.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -22,7 +22,7 @@ Draw = Callable[[np.random.Generator, float], float]
 
 
 def _of_extent(least: float, greatest: float, *, signed: bool = False) -> Draw:
-    """Draw a fraction of the signal's extent, or of 1 if the signal was always 0."""
+    """Return a draw of a fraction of the signal's extent, or of 1 if the signal was always 0."""
 
     def draw(rng: np.random.Generator, extent: float) -> float:
         sign = float(rng.choice((-1.0, 1.0))) if signed else 1.0
@@ -68,7 +68,7 @@ MESSAGES: Final[Mapping[str, Draw]] = {
 
 @dataclass(frozen=True, slots=True)
 class Family:
-    """One way to falsify one signal of one device."""
+    """One way of falsifying one signal of one device."""
 
     role: str
     signal: str
@@ -81,7 +81,7 @@ class Family:
         return f"{self.role} {self.signal} {self.fault}"
 
     def draw(self, rng: np.random.Generator, hold: float) -> Fault[SimContext]:
-        """Return one fault of the family that lasts ``hold`` seconds."""
+        """Return one fault from the family that lasts ``hold`` seconds."""
         if self.signal == MESSAGE:
             return self._message(MESSAGES[self.fault](rng, 0.0), hold)
         draw, own = ARGUMENTS.get(self.fault), rng.spawn(1)[0]
@@ -105,7 +105,7 @@ def families(robot: SimulatedRobot, *, used: bool = False) -> tuple[Family, ...]
 
     Args:
         robot: the robot.
-        used: restrict to signals that drivers have read or written so far; faults in others have no effect.
+        used: restrict to signals that drivers have read or written so far; faults in other signals have no effect.
     """
 
     def of(devices: Mapping[str, Any]) -> Iterator[Family]:

@@ -1,4 +1,4 @@
-"""Faults of the simulation: their kinds, their places, and the catalog of random faults.
+"""Simulated faults: their kinds and places, and the catalog of random faults.
 
 A fault is a pair of actions on a ``SimContext``: one starts it, the other ends it. Scripted scenarios and random drills
 use the same actions.
@@ -48,7 +48,7 @@ UNKNOWN_CODES: Final = (*range(3, 20),)
 
 
 class FaultKind(StrEnum):
-    """Kinds of faults in the catalog, by their names in reports."""
+    """Kinds of faults in the catalog, by name in reports."""
 
     UNPLUG = "unplug"
     HUB_LOSS = "hub loss"
@@ -97,25 +97,25 @@ class RecorderDisk(Protocol):
 
 
 class ComputerPower(Protocol):
-    """Supply of the computer that a daemon runs on."""
+    """Power supply of the computer that runs a daemon."""
 
     async def cut(self) -> None:
-        """End the daemon at once; its cables must be dead before."""
+        """End the daemon immediately; its cables must already be dead."""
 
     def give(self) -> None:
-        """Start a new daemon, as after the computer's start."""
+        """Start a new daemon, as after a boot."""
 
 
 class Workers(Protocol):
     """Worker processes of a daemon."""
 
     def kill(self, name: str) -> None:
-        """Kill a worker as SIGKILL does, and wait for its end; no effect if the worker is not running."""
+        """Kill a worker as with SIGKILL and wait for its end; no effect if the worker is not running."""
 
 
 @dataclass(frozen=True, slots=True)
 class SimContext:
-    """Targets of faults: the simulation, and of the daemon only its disk, its workers and its computer's supply.
+    """Fault targets: the simulation, and the daemon's disk, workers and computer supply.
 
     Args:
         config: configuration of the simulation.
@@ -124,7 +124,7 @@ class SimContext:
         computer: USB tree and cables.
         clock: time.
         disk: disk of the recording; None without a recorder.
-        power: supply of the computer; None if it is this computer.
+        power: supply of the computer; None if the daemon runs on this computer.
         workers: worker processes; None if no fault affects them.
     """
 
@@ -142,7 +142,7 @@ class SimContext:
         return Emulated(self.robot.emulators[role], self.computer.ports[role])
 
     def signals(self, role: str) -> Signals:
-        """Return the signals of a device, or of a monitor of the computer.
+        """Return the signals of a device or of a computer monitor.
 
         Raises:
             InputError: the robot has no such device, or the device declares no signals.
@@ -173,7 +173,7 @@ class SimContext:
 
         Args:
             hubs: names.
-            enumerated: whether all devices behind the hub are present at once, as after the computer's start.
+            enumerated: whether all devices behind the hub are present immediately, as after a boot.
         """
         times = {"first": 0.0, "between": 0.0} if enumerated else {}
         usb, clock = self.computer.usb, self.clock
@@ -202,7 +202,7 @@ async def apply(action: Action[C], context: C) -> None:
 
 
 def nothing(_: SimContext) -> None:
-    """End a fault that passes by itself."""
+    """Do nothing: the end of a fault that passes by itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,7 +288,7 @@ Maker = Callable[[np.random.Generator], CatalogFault]
 
 
 def hubs_of(devices: Devices, without: Collection[str] = ()) -> tuple[str, ...]:
-    """Hubs with connected devices, except devices of the roles ``without``."""
+    """Hubs with connected devices, ignoring devices with the roles ``without``."""
     hubs: dict[str, set[str]] = {}
     for role, device in devices.present().items():
         if isinstance(device.port, UsbPortConfig):
@@ -297,7 +297,7 @@ def hubs_of(devices: Devices, without: Collection[str] = ()) -> tuple[str, ...]:
 
 
 class FaultCatalog:
-    """Catalog of the faults of a robot.
+    """Catalog of a robot's faults.
 
     Args:
         devices: devices of the robot.
@@ -444,7 +444,7 @@ def _fault(
     must_stop: bool = False,
     disarms: bool = False,
 ) -> CatalogFault:
-    """Return a fault of a device, hub or rail."""
+    """Return a fault in a device, hub or rail."""
     name = f"{kind.value}: {where}" if where else kind.value
     return CatalogFault(name=name, start=start, end=end, hold=hold, kind=kind, must_stop=must_stop, disarms=disarms)
 
@@ -504,7 +504,7 @@ def _encoder(rng: np.random.Generator, kind: FaultKind, fault: str) -> CatalogFa
 
 
 def _cross_talk(rng: np.random.Generator, name: str) -> CatalogFault:
-    """Simulate the sound of another sonar: an echo from a distance without an object."""
+    """Simulate the sound of another sonar: an echo from a distance where there is no object."""
     metres = rng.uniform(0.15, 3.0)
     starts, ends = command("sonar", f"ghost {name} {metres:.2f}"), command("sonar", f"ghost {name} off")
     return _fault(FaultKind.CROSS_TALK, f"{name}, {metres:.2f} m", starts, ends, _hold(rng))
@@ -526,7 +526,7 @@ def _slow(rng: np.random.Generator, role: str) -> CatalogFault:
 
 
 def _short_write(rng: np.random.Generator, role: str, guarded: Collection[str]) -> CatalogFault:
-    """Shorten writes; many in a row disconnect a controller, so an unguarded controller gets few."""
+    """Shorten writes; several in a row disconnect a controller, so an unguarded controller gets only a few."""
     most = SHORT_WRITES if role in guarded else BRIEF_SILENCES
     start, end = (f"line short_writes {rng.integers(1, most + 1)}",), ("line short_writes 0",)
     return _cable(rng, FaultKind.SHORT_WRITE, role, start, end)
@@ -548,7 +548,7 @@ def _blind(rng: np.random.Generator) -> CatalogFault:
 
 
 def _clock_drift(rng: np.random.Generator) -> CatalogFault:
-    """Simulate a bad crystal, or the slew of a clock that is being set."""
+    """Simulate an inaccurate crystal, or the slew of a clock that is being set."""
     ppm = float(rng.choice((-1.0, 1.0)) * 10 ** rng.uniform(2, 5))
     start, end = command("lidar", f"drift {ppm:.0f}"), command("lidar", "drift 0")
     return _fault(FaultKind.CLOCK_DRIFT, f"{ppm:+.3g} ppm", start, end, float(rng.uniform(2.0, 5.0)))
@@ -562,13 +562,13 @@ def _late_answers(rng: np.random.Generator, role: str) -> CatalogFault:
 
 
 def _supply_dip(rng: np.random.Generator, roles: tuple[str, ...]) -> CatalogFault:
-    """Restart the controller while the host waits for its answer; the truck coasts until it is up."""
+    """Restart the controller while the host waits for its answer; the truck coasts until the controller is up again."""
     role = roles[0] if len(roles) == 1 else _pick(rng, roles)
     return _fault(FaultKind.SUPPLY_DIP, role, command(role, "restart 1"), nothing, 1.0 + _hold(rng), disarms=True)
 
 
 def _blocked_shaft(rng: np.random.Generator, shafts: int) -> CatalogFault:
-    """Block one of several shafts, which does not hold the robot: the others turn until the gate detects it."""
+    """Block one of several shafts, which does not hold the robot: the others turn until the gate detects the fault."""
     shaft = 0 if shafts == 1 else int(rng.integers(shafts))
     held, free, where = block_shaft(shaft, on=True), block_shaft(shaft, on=False), "" if shafts == 1 else DRIVES[shaft]
     return _fault(FaultKind.BLOCKED_SHAFT, where, held, free, 1.0 + _hold(rng), must_stop=shafts == 1, disarms=True)
@@ -603,7 +603,7 @@ def _clock_jump(rng: np.random.Generator) -> CatalogFault:
 
 
 def _loop_stall(rng: np.random.Generator) -> CatalogFault:
-    """Block the event loop, as another program on the processor does; devices, cables and world continue."""
+    """Block the event loop, as another program on the processor would; devices, cables and world continue."""
     seconds = float(10 ** rng.uniform(-1.3, 0.5))
 
     def stall(context: SimContext) -> None:
@@ -627,7 +627,7 @@ def _obstacle(rng: np.random.Generator) -> CatalogFault:
 
 
 def _network(rng: np.random.Generator) -> CatalogFault:
-    """Remove the network interface, or its signal."""
+    """Remove the network interface or its signal."""
     lost, back = (("remove",), ("plug",)) if rng.random() < 0.5 else (("signal", "-95"), ("signal", "-55"))
     lose, give_back = monitored("link", *lost), monitored("link", *back)
     return _fault(FaultKind.NETWORK, lost[0], lose, give_back, float(rng.uniform(1.5, 3.0)))
@@ -685,9 +685,10 @@ def _hubs(rng: np.random.Generator, kind: FaultKind, hubs: tuple[str, ...]) -> C
 
 
 def _computer_power(rng: np.random.Generator, hubs: tuple[str, ...]) -> CatalogFault:
-    """Cut the computer's supply (M4-ATX): computer, hubs, lidar and servos are off, motor and stabiliser stay on.
+    """Cut the computer's supply (M4-ATX): computer, hubs, lidar and servos go off; motor and stabiliser remain on.
 
-    The boot time of the computer is not simulated: the fault ends with enumerated hubs and a new daemon.
+    The boot time of the computer is not simulated: when the fault ends, the hubs are enumerated and a new daemon
+    starts.
     """
 
     async def lose(context: SimContext) -> None:
@@ -706,7 +707,7 @@ def _computer_power(rng: np.random.Generator, hubs: tuple[str, ...]) -> CatalogF
 
 
 def _battery_off(rng: np.random.Generator) -> CatalogFault:
-    """Cut the supply of motor, servos and stabiliser; the computer keeps its own."""
+    """Cut the supply of motor, servos and stabiliser; the computer keeps its own supply."""
 
     def pull(context: SimContext) -> None:
         context.robot.world.connect_battery(context.clock.now(), connected=False)
@@ -729,7 +730,7 @@ class FaultInjector:
     Args:
         context: targets of the faults.
         config: seed and period.
-        report: called with a line for each fault.
+        report: called with one line for each fault.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Truck of emulated devices in a simulated world, on any clock and any kind of port."""
+"""A truck of emulated devices in a simulated world, with any clock and any kind of port."""
 
 import asyncio
 from collections.abc import Mapping
@@ -30,14 +30,14 @@ class SimulatedRobot:
     """World and emulators, wired as on the truck.
 
     Args:
-        config: settings of the simulation.
+        config: simulation settings.
         devices: devices of the robot, with their settings.
         monitors: monitors of the computer.
-        clock: time of world and devices.
+        clock: clock of the world and the devices.
         ports: one emulated port per device role; ``run`` plugs them in.
         root: folder of the emulated computer, for its monitors.
-        offload: runs the drawing of the camera's pictures.
-        scene: world shared with other robots; None: a separate one.
+        offload: runs the rendering of camera images.
+        scene: world shared with other robots; None for a separate world.
         name: name of the robot.
     """
 
@@ -76,7 +76,7 @@ class SimulatedRobot:
         self._wire_deadman(config, devices)
 
     def _wire_deadman(self, config: SimConfig, devices: Devices) -> None:
-        """Set the servo controller's timeout, and connect its output to the drive controllers' quick-stop inputs."""
+        """Set the servo controller's timeout and connect its output to the drive controllers' quick-stop inputs."""
         maestro = self.emulators.get(DeviceRole.STEERING)
         if devices.steering is None or not isinstance(maestro, MaestroEmulator):
             return

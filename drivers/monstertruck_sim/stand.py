@@ -1,4 +1,4 @@
-"""Test stand of the simulated world: observes the robot from outside, with the noise of a camera above the table."""
+"""Test stand in the simulated world: observes the robot from outside, with the noise of a camera above the table."""
 
 import math
 from collections.abc import Callable
@@ -19,7 +19,7 @@ class SimulatedStand:
         world: world with the robot.
         clock: time.
         put: called with every pose.
-        seed: seed of the noise; None: no noise.
+        seed: noise seed; None for no noise.
     """
 
     def __init__(

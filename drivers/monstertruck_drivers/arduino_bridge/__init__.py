@@ -1,1 +1,1 @@
-"""Microcontroller boards with the text protocol of ROSArduinoBridge."""
+"""Microcontroller boards that speak the ROSArduinoBridge text protocol."""

@@ -1,4 +1,4 @@
-"""Settings of boards with ROSArduinoBridge."""
+"""Settings for boards that run ROSArduinoBridge."""
 
 import math
 from typing import Annotated, Literal, Self
@@ -48,12 +48,12 @@ class ArduinoBridgeConfig(Schema):
 
     @property
     def turn(self) -> float:
-        """Angle per count (rad)."""
+        """Angle per encoder count (rad)."""
         return math.tau / self.counts_per_turn
 
     @property
     def motor_limits(self) -> MotorLimits:
-        """Limits of a motor."""
+        """Motor limits."""
         return MotorLimits(self.max_rate, self.deceleration, self.quick_deceleration)
 
     @property

@@ -1,4 +1,4 @@
-"""Driver of a board with ROSArduinoBridge: ``cmd/drive`` and ``cmd/drive_2`` in, encoder counts out.
+"""Driver for a ROSArduinoBridge board: ``cmd/drive`` and ``cmd/drive_2`` in, encoder counts out.
 
 One exchange per cycle sends the set-points of both motors and reads both counters. The first and the last command of
 every session stop the motors. Every set-point also feeds the board's watchdog.
@@ -26,18 +26,18 @@ Counts = tuple[int, int]
 
 
 class BoardSetpoint(NamedTuple):
-    """Set-points of the motors."""
+    """Motor set-points."""
 
     mode: DriveMode
     command: bytes
 
 
 def setpoint_of(commands: Sequence[DriveCommand | None], now: int, config: ArduinoBridgeConfig) -> BoardSetpoint:
-    """Combine the latest commands of both shafts into set-points; stale commands stop.
+    """Combine the latest commands of both shafts into set-points; a stale command stops its motor.
 
     Args:
-        commands: latest command of each shaft, if any.
-        now: time (ns).
+        commands: latest command for each shaft, if any.
+        now: current time (ns).
         config: signs, limits and timeouts.
     """
     mode, known = requested(commands, now, config.command_timeout)
@@ -52,7 +52,7 @@ def setpoint_of(commands: Sequence[DriveCommand | None], now: int, config: Ardui
 
 
 class ArduinoBridgeDriver(MotorBoard[ArduinoBridgeConfig, BoardSession]):
-    """Service of both motors; see ``MotorBoard``. The topics of a third and a fourth shaft are not used."""
+    """Drive service for both motors; see ``MotorBoard``. The topics for third and fourth shafts are unused."""
 
     def __init__(
         self,
@@ -99,10 +99,10 @@ class ArduinoBridgeDriver(MotorBoard[ArduinoBridgeConfig, BoardSession]):
         self._take(counts, (session.asked + self._clock.now()) // 2)
 
     def _take(self, counts: Counts, stamp: int) -> None:
-        """Add up counts and publish.
+        """Accumulate the encoder counts and publish them.
 
         Raises:
-            DeviceRestartedError: the counters jumped.
+            DeviceRestartedError: the counters jumped, so the board restarted.
         """
         config = self._config
         if self._readings:

@@ -1,8 +1,8 @@
 """Device side of ROSArduinoBridge: text lines, a speed controller in whole counts, and the auto-stop timer.
 
-Behaviour of the real board: it restarts when its port is opened, ignores input for 1.5 s, and then counts from 0. It
-executes damaged commands, because there is no checksum. Its speed controller works in whole counts per period. It stops
-the motors when no set-point has arrived for two seconds (published firmware).
+Like the real board, it restarts when its port is opened, ignores input for 1.5 s, and then counts from 0. It executes
+damaged commands, because there is no checksum. Its speed controller works in whole counts per period. It stops the
+motors when no set-point has arrived for two seconds (published firmware).
 """
 
 import asyncio
@@ -27,12 +27,12 @@ TO_RPM: Final = 60.0
 class ArduinoBridgeEmulator(FaultyDevice):
     """Board with two motors.
 
-    Faults (``inject``): ``silent on|off`` (no answers), ``late SECONDS [COUNT]`` (late answers), ``noise COUNT``
-    (COUNT answers have a wrong byte), ``reset``, ``runaway`` (both motors disobey, see ``DisobedientMotor``).
+    Faults (``inject``): ``silent on|off`` (no answers), ``late SECONDS [COUNT]`` (late answers), ``noise COUNT`` (COUNT
+    answers contain a wrong byte), ``reset``, ``runaway`` (both motors disobey, see ``DisobedientMotor``).
 
     Args:
         clock: time.
-        plants: loads of the motors; missing ones are replaced by free motors.
+        plants: motor loads; missing entries are replaced by unloaded motors.
         settings: counts, auto-stop.
     """
 
@@ -94,7 +94,7 @@ class ArduinoBridgeEmulator(FaultyDevice):
                     self._answer(end, self._obey(line))
 
     async def _watch(self) -> None:
-        """Stop the motors when no set-points arrive."""
+        """Stop the motors when set-points cease to arrive."""
         while True:
             await self._clock.sleep(0.01)  # seconds between two checks of the auto-stop
             if any(self._targets) and self._clock.now() - self._fed > self._config.auto_stop * SECOND:
@@ -133,7 +133,7 @@ class ArduinoBridgeEmulator(FaultyDevice):
         self._drive()
 
     def _drive(self) -> None:
-        """Set the target speeds of the motors."""
+        """Apply the target speeds to the motors."""
         now = self._clock.now()
         for plant, target in zip(self._plants, self._targets, strict=True):
             wanted = target
@@ -160,13 +160,13 @@ class ArduinoBridgeEmulator(FaultyDevice):
 
 
 def _atoi(word: bytes) -> int:
-    """Parse a number as C does: 0 if there is none."""
+    """Parse an integer like C's ``atoi``: 0 if there is none."""
     sign, digits = (-1, word[1:]) if word.startswith(b"-") else (1, word)
     end = next((i for i, byte in enumerate(digits) if not 48 <= byte <= 57), len(digits))
     return sign * int(digits[: min(end, 9)] or b"0")
 
 
 def emulated(setup: EmulatorSetup) -> ArduinoBridgeEmulator:
-    """Create the board of a simulated robot's first two shafts, on a line of realistic speed."""
+    """Create the board for a simulated robot's first two shafts, with a realistic line speed."""
     setup.port.device.baud = BOARD_BAUD
     return ArduinoBridgeEmulator(setup.clock, setup.physics.motors[:2], setup.settings)

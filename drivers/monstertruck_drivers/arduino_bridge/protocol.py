@@ -1,22 +1,22 @@
-"""Text protocol of ROSArduinoBridge; standard library only, for the stop script.
+"""ROSArduinoBridge text protocol; uses only the standard library because the stop script imports it.
 
 Source: Patrick Goebel and James Nugen, ``commands.h`` and ``ROSArduinoBridge.ino``. The host sends a letter and its
-arguments, separated by spaces, and a carriage return. The board answers every command by one line that ends with CR and
-LF, and sends nothing else. There is no checksum and no sequence number.
+arguments, separated by spaces, and a carriage return. The board answers every command with one line that ends with CR
+and LF, and sends nothing else. There is no checksum and no sequence number.
 
 ============== =========================================================== =================
 command        meaning                                                     answer
 ============== =========================================================== =================
-``m L R``      hold so many counts for each period of the controller       ``OK``
+``m L R``      speed in encoder counts per controller period               ``OK``
 ``o L R``      raw PWM, -255 to 255, without the controller                ``OK``
 ``e``          counts of both encoders since power-up or reset             ``L R``
-``r``          set them to 0                                               ``OK``
+``r``          reset both counters                                         ``OK``
 ``u P:D:I:O``  gains of the controller                                     ``OK``
 ``b``          baud rate                                                   a number
 ============== =========================================================== =================
 
-Any other input is answered by ``Invalid Command``. Without ``m`` or ``o`` for ``AUTO_STOP_INTERVAL``, 2000 ms as
-published, the board stops both motors. The interval is compiled in.
+The board answers any other input with ``Invalid Command``. Without ``m`` or ``o`` for ``AUTO_STOP_INTERVAL``, 2000 ms
+as published, the board stops both motors. The interval is compiled in.
 """
 
 import re
@@ -57,7 +57,7 @@ def counts_of(line: bytes) -> tuple[int, int] | None:
 
 
 def is_number(line: bytes) -> bool:
-    """Whether a line is an answer to ``b``."""
+    """Whether a line is a valid answer to ``b``."""
     return _NUMBER.fullmatch(line) is not None
 
 
@@ -69,7 +69,7 @@ class BoardLines:
         self._rest = bytearray()
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Return the completed lines without their ends; a line that never ends is dropped."""
+        """Return the completed lines without line endings; an overlong line is dropped."""
         self._rest += data
         *lines, rest = bytes(self._rest).split(self._end)
         self._rest = bytearray(rest if len(rest) <= LONGEST_LINE else b"")

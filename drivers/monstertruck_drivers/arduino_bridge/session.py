@@ -1,4 +1,4 @@
-"""Commands and answers of a board over one open link; shared by the driver and `identify`."""
+"""Commands and answers over one open link to a board; shared by the driver and `identify`."""
 
 from monstertruck_drivers.arduino_bridge.config import ArduinoBridgeConfig
 from monstertruck_drivers.arduino_bridge.protocol import (
@@ -23,7 +23,7 @@ class BoardSession:
     Args:
         link: open link.
         clock: time.
-        timeout: timeout of an answer (s).
+        timeout: maximum time to wait for an answer (s).
     """
 
     def __init__(self, link: Link, clock: Clock, timeout: float) -> None:
@@ -39,18 +39,18 @@ class BoardSession:
         """Send commands without waiting for their answers.
 
         Raises:
-            DeviceLostError: unplugged.
+            DeviceLostError: the board was unplugged.
         """
         self._link.write(b"".join(commands))
 
     async def identify(self, boot: float) -> None:
-        """Stop the motors, and wait until the board answers.
+        """Stop the motors and wait until the board answers.
 
         Args:
             boot: maximum boot time (s).
 
         Raises:
-            DeviceLostError: unplugged.
+            DeviceLostError: the board was unplugged.
             DeviceTimeoutError: the board is silent.
             WrongDeviceError: another device answers.
         """
@@ -71,7 +71,7 @@ class BoardSession:
         """Send a command and read both encoders.
 
         Raises:
-            DeviceLostError: unplugged.
+            DeviceLostError: the board was unplugged.
             DeviceTimeoutError: an answer is missing.
             ProtocolError: an answer is invalid.
         """
@@ -91,7 +91,7 @@ class BoardSession:
             self._lines = BoardLines()
 
     async def _collect(self, within: float, count: int) -> list[bytes]:
-        """Collect at most ``count`` lines within ``within`` seconds, ignoring empty lines and rejections of noise."""
+        """Collect up to ``count`` lines within ``within`` seconds; ignore empty lines and rejections of noise."""
         found: list[bytes] = []
         due = self._clock.now() + round(within * SECOND)
         while len(found) < count and (left := due - self._clock.now()) > 0:
@@ -108,10 +108,10 @@ async def identify(link: Link, clock: Clock, settings: ArduinoBridgeConfig) -> d
     """Read both counters; stopping the motors identifies the board.
 
     Returns:
-        JSON-compatible: ``counts`` left and right.
+        JSON-compatible dict: ``counts`` (left, right).
 
     Raises:
-        DeviceError: as for the driver's ``run``.
+        DeviceError: the same errors as from the driver's ``run``.
     """
     session = BoardSession(link, clock, settings.answer_timeout)
     await session.identify(settings.boot)

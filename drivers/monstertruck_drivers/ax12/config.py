@@ -12,7 +12,7 @@ Seconds = Annotated[float, Field(ge=0)]
 
 
 class JointConfig(Schema):
-    """One unit: ``position = zero + direction * angle / step``."""
+    """Calibration of one unit: ``position = zero + direction * angle / step``."""
 
     id: Annotated[int, Field(ge=0, le=252)]
     """Id of the unit on its bus."""
@@ -44,7 +44,7 @@ class JointConfig(Schema):
 
 
 class AlarmConfig(Schema):
-    """Recovery of a joint that lost its torque."""
+    """Recovery of a joint that has lost its torque."""
 
     rest: Seconds = 3.0
     """Waiting time after an alarm (s); doubled if it trips again."""
@@ -63,7 +63,7 @@ class AlarmConfig(Schema):
 
 
 class Ax12Config(Schema):
-    """Two Dynamixel AX-12A servos for pitch and roll of the lidar's mount."""
+    """Two Dynamixel AX-12A servos that move the lidar mount in pitch and roll."""
 
     kind: Literal["ax12"] = "ax12"
     pitch: JointConfig = JointConfig(id=1, zero=511, min_position=409, max_position=613)
@@ -81,11 +81,11 @@ class Ax12Config(Schema):
     absent_interval: Annotated[float, Field(ge=1)] = 1.0
     """Seconds between two requests to a joint that does not answer: each costs a whole timeout."""
     return_delay: Annotated[float, Field(ge=0, le=508e-6)] = 500e-6
-    """Delay of a unit before its answer (s): a setting of the unit."""
+    """Delay before a unit answers (s), as set in the unit."""
     usb_latency: Annotated[float, Field(ge=0, le=0.255)] = 0.016
     """Latency timer of the adapter (s); 0.001 only if confirmed."""
     command_timeout: Annotated[float, Field(gt=0, le=5)] = 0.5
-    """Age of stale joint goals (s): they are ignored and the joints hold."""
+    """Age at which joint goals are stale (s): they are ignored and the joints hold."""
     alarm: AlarmConfig = AlarmConfig()
 
     @model_validator(mode="after")
@@ -96,11 +96,11 @@ class Ax12Config(Schema):
 
     @property
     def speed_word(self) -> int:
-        """``speed`` in the unit's units; never 0, which would mean unlimited."""
+        """``speed`` as a register value; never 0, which would mean unlimited."""
         return max(1, round(self.speed / SPEED_UNIT))
 
     def timeout(self, size: int, baud: int = AX12_BAUD) -> float:
-        """Timeout of an exchange of ``size`` bytes (s): line, return delay, and the adapter in both directions."""
+        """Timeout for an exchange of ``size`` bytes (s): transfer, return delay, and adapter latency both ways."""
         timeout_min = 0.005  # seconds; below this a busy host misses timely answers
         scheduling = 0.002  # additional delay by the host (s)
         return max(timeout_min, size * 10 / baud + self.return_delay + 2 * self.usb_latency + scheduling)

@@ -1,4 +1,4 @@
-"""Stabiliser driver: joint goals out; angles, loads, heat and alarms of both servos in."""
+"""Stabiliser driver: sends joint goals; reads angles, loads, temperatures and alarms of both servos."""
 
 import contextlib
 from typing import Final
@@ -23,12 +23,12 @@ ANSWERS_ALL: Final = b"\x02"
 
 
 class Joint:
-    """Keeps one unit at its goal; it waits only in ``join`` and ``poll``.
+    """Keeps one unit at its goal; only ``join`` and ``poll`` wait for the bus.
 
     **Alarms.** An overloaded or overheated unit sets its torque limit to 0 and goes limp. It still answers, and its
-    error bits may clear although it stays limp. So the driver reads the torque settings when the bits change and at
-    intervals. After a waiting time, once the unit is cool, the driver switches its torque on; it first sets the goal to
-    the current position, so that the unit does not jump.
+    error bits may clear although it stays limp. The driver therefore reads the torque settings at intervals and
+    whenever the bits change. After a waiting time, once the unit is cool, the driver switches its torque on; it first
+    sets the goal to the current position, so that the unit does not jump.
 
     **Motion without a goal.** A load pushes a joint away from its goal against the unit's torque. A unit that moves
     away from its goal in the direction of its own torque does not obey: the driver removes its torque.
@@ -36,9 +36,9 @@ class Joint:
     Args:
         name: ``pitch`` or ``roll``.
         joint: calibration.
-        config: times and limits.
-        clock: source of time.
-        events: alarms, losses and returns.
+        config: timing and limits.
+        clock: time source.
+        events: alarms, and the unit going silent or answering again.
         source: service name.
     """
 
@@ -85,12 +85,12 @@ class Joint:
         return None if self._present is None else self._joint.angle(self._present.position)
 
     def goal(self, angle: float) -> bytes:
-        """Set the goal for a joint angle (rad), within the limits; return the bytes of the goal register."""
+        """Set the goal to a joint angle (rad), clamped to the limits; return the bytes for the goal register."""
         self._goal = self._joint.position(angle)
         return p.GOAL_POSITION.encode(self._goal)
 
     def feedback(self) -> StabiliserJoint:
-        """Feedback for the message, in the signs of the joint angle."""
+        """Feedback for the message, with the sign of the joint angle."""
         present = self._present
         if present is None:
             return StabiliserJoint(torque=self.torque, strays=self._strays)
@@ -111,11 +111,11 @@ class Joint:
         """Check that the unit is present and matches the configuration; the next ``poll`` makes it hold its position.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: it does not answer.
+            DeviceLostError: the adapter was unplugged.
+            DeviceTimeoutError: the unit does not answer.
             ProtocolError: the unit refuses.
-            WrongDeviceError: not an AX-12A.
-            DeviceMismatchError: it is in endless-turn mode, or its limits exclude configured goals.
+            WrongDeviceError: the unit is not an AX-12A.
+            DeviceMismatchError: the unit is in endless-turn mode, or its limits exclude configured goals.
         """
         self._ask_at = self._clock.now() + round(self._config.absent_interval * SECOND)
         await session.ping(self.id, retries)
@@ -136,8 +136,8 @@ class Joint:
         """Read the unit and act on its state.
 
         Raises:
-            DeviceLostError: unplugged.
-            WrongDeviceError: the unit was replaced by another kind.
+            DeviceLostError: the adapter was unplugged.
+            WrongDeviceError: the unit was replaced by another model.
             DeviceMismatchError: its settings do not match.
         """
         try:
@@ -156,7 +156,7 @@ class Joint:
             self._miss(str(error))
 
     def _is_straying(self, before: Present, present: Present) -> bool:
-        """Whether the unit drives itself away from its goal, in three consecutive readings."""
+        """Whether the unit drove itself away from its goal in three consecutive readings."""
         if self.torque is not TorqueState.HOLDING or self._goal is None:
             self._straying = 0
             return False
@@ -167,7 +167,7 @@ class Joint:
         return self._straying >= strays
 
     async def _stop_straying(self, session: Ax12Session, present: Present) -> None:
-        """Switch the torque off for a waiting time; read it back, because a late answer may belong to an earlier write.
+        """Switch the torque off for a waiting time, and read it back: a late answer may belong to an earlier write.
 
         Raises:
             DeviceTimeoutError, ProtocolError: the unit does not confirm torque off; the next reading repeats it.
@@ -200,7 +200,7 @@ class Joint:
             await self._hold(session, present)
 
     async def _hold(self, session: Ax12Session, present: Present) -> None:
-        """Switch the torque on without a jump: set the goal to the current position, or the nearest limit."""
+        """Switch the torque on without a jump: first set the goal to the current position or the nearest limit."""
         config, joint = self._config, self._joint
         goal = min(max(present.position, joint.min_position), joint.max_position)
         words = (p.GOAL_POSITION, goal), (p.MOVING_SPEED, config.speed_word), (p.TORQUE_LIMIT, self._max_torque)
@@ -225,7 +225,7 @@ class Joint:
             self._report(Reason.DEVICE_FAULT, Severity.ERROR, text, error=int(self._error))
 
     def _begin_rest(self) -> float:
-        """Start a waiting time and return its length (s); it doubles if it follows too soon."""
+        """Start a waiting time and return its length (s), which doubles if the previous one ended too recently."""
         alarm, now = self._config.alarm, self._clock.now()
         if self._held_at is not None and now - self._held_at >= alarm.settled_after * SECOND:
             self._rest = alarm.rest
@@ -253,7 +253,7 @@ class Joint:
         )
 
     async def _settings(self, session: Ax12Session, retries: int = 0) -> tuple[int, int, int]:
-        """Torque switch, moving speed, torque limit."""
+        """Read the torque switch, the moving speed and the torque limit."""
         settings = 12  # bytes from the torque switch to the torque limit
         answer = await session.read(self.id, p.TORQUE_ENABLE, settings, retries)
         self._error, data = answer.error, answer.data
@@ -284,7 +284,7 @@ class Joint:
     # Reports
 
     def _report_alarms(self, error: Alarm, now: int) -> None:
-        """Report each error bit once, until all have been clear for a while."""
+        """Report each error bit once; it is reported again only after all bits have been clear for a while."""
         if not error:
             if self._reported and now - self._clean_since >= self._config.alarm.settled_after * SECOND:
                 self._reported = Alarm(0)
@@ -300,7 +300,7 @@ class Joint:
 
 
 class Ax12Driver:
-    """Forwards joint goals as they arrive, in one sync write for both units, and reads both in between.
+    """Forwards joint goals as they arrive, in one sync write for both units, and reads both units between goals.
 
     The units have no watchdog: they hold their last goal when goals stop or the session ends. If one unit does not
     answer, the other continues; if none answers, the session is lost (12 V rail or bus).
@@ -308,10 +308,10 @@ class Ax12Driver:
     Args:
         config: calibration, rates, timeouts, alarms.
         port: the adapter's port, at 1 Mbaud.
-        clock: time, also the clock of the goals' stamps.
+        clock: time source; goals are stamped with the same clock.
         commands: joint goals.
-        out: feedback, joint angles in rad, REP 103 signs.
-        events: alarms, losses and returns of the units.
+        out: feedback; joint angles in rad with REP 103 signs.
+        events: alarms, and units that stop or resume answering.
         name: service name.
     """
 
@@ -339,7 +339,7 @@ class Ax12Driver:
         """Serve one session.
 
         Raises:
-            DeviceLostError: unplugged.
+            DeviceLostError: the adapter was unplugged.
             DeviceTimeoutError: no unit answers.
             WrongDeviceError: another device answers, or units other than AX-12A.
             DeviceMismatchError: a unit's own limits contradict the configuration.

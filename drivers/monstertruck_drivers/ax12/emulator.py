@@ -1,4 +1,4 @@
-"""Device side of a bus of AX-12A behind a USB2Dynamixel, byte for byte."""
+"""Emulated AX-12A bus behind a USB2Dynamixel adapter, byte for byte."""
 
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
@@ -66,28 +66,29 @@ UNIT_FAULTS: Final[Mapping[str, Callable[..., None]]] = {
 class Ax12Bus(FaultyDevice):
     """Up to six units on one half-duplex line; ``end.baud = 1_000_000`` gives exchanges their real duration.
 
-    USB powers the adapter, the 12 V rail the units: unplugging does not affect the units, ``power off`` silences them
-    all while the port stays. Two units with the same id both answer, and their answers collide.
+    USB powers the adapter and the 12 V rail powers the units: unplugging does not affect the units, and ``power off``
+    silences all units while the port remains. Two units with the same id both answer, and their answers collide.
+
     Faults (``inject``): ``vanish ID``, ``return ID``, ``power on|off``, ``block ID on|off``, ``freeze ID on|off``
     (position sensor), ``heat ID CELSIUS``, ``voltage VOLTS|source``, ``trip ID`` (overload now), ``stray ID
-    POSITION|off`` (turns to POSITION instead of its goal), ``reset ID`` (factory), ``renumber ID NEW``,
-    ``latch on|off`` (error bits outlast their cause), ``echo on|off``, and for the next ``COUNT`` (1) answers ``mute``,
-    ``double``, ``truncate``, ``garble`` and ``late SECONDS``.
+    POSITION|off`` (turns to POSITION instead of its goal), ``reset ID`` (factory), ``renumber ID NEW``, ``latch
+    on|off`` (error bits outlast their cause), ``echo on|off``, and, for the next ``COUNT`` answers (default 1),
+    ``mute``, ``double``, ``truncate``, ``garble`` and ``late SECONDS``.
 
     Args:
         clock: time.
-        ids: numbers of the units.
-        seed: seed of the damage by collisions of answers.
+        ids: unit ids.
+        seed: seed for the corruption of colliding answers.
         echo: the adapter echoes every byte it receives from the host.
-        latency_s: latency that the adapter adds towards the host (s).
+        latency_s: latency that the adapter adds to answers (s).
         host_baud: baud rate of the host's port; units set to another rate receive nothing.
-        answers_damage: whether a request with a wrong sum is answered (checksum error bit) or ignored.
-        positions: initial positions of the shafts by unit number (steps); default 512.
+        answers_damage: whether a request with a wrong checksum is answered (checksum error bit) or ignored.
+        positions: initial shaft positions by unit id (steps); default 512.
         load: load on the shafts.
         voltage: supply voltage at the units.
 
     Raises:
-        InputError: too many units, or a bad number.
+        InputError: too many units, or an invalid id.
     """
 
     def __init__(
@@ -145,7 +146,7 @@ class Ax12Bus(FaultyDevice):
     # Interface to the simulated world
 
     def angle(self, ident: int, time_ns: int) -> float:
-        """Shaft angle of a unit, rad, counter-clockwise positive, 0 at position 0; see ``angles``."""
+        """Shaft angle of a unit (rad), counter-clockwise positive, 0 at position 0; see ``angles``."""
         return float(self.angles(ident, np.array([time_ns]))[0])
 
     def angles(self, ident: int, times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -153,7 +154,7 @@ class Ax12Bus(FaultyDevice):
         return self._find(ident).angles(times_ns) * p.STEP
 
     def power_cycle(self) -> None:
-        """12 V off and on: the second part of the control table is lost."""
+        """Switch the 12 V supply off and on: the RAM area of the control table is lost."""
         self._power(on=False)
         self._power(on=True)
 
@@ -288,7 +289,7 @@ class Ax12Bus(FaultyDevice):
 
 
 def really(joint: JointConfig, horn: Horn) -> tuple[float, int]:
-    """Zero (steps) and direction of a joint as assembled."""
+    """Actual zero position (steps) and direction of a joint, given its assembly."""
     zero = joint.zero if horn.zero is None else horn.zero
     return float(zero), joint.direction if horn.direction is None else horn.direction
 
@@ -299,7 +300,7 @@ class TrueJoints:
     Args:
         bus: bus of the units.
         config: assignment of units to joints.
-        horns: assembly of both servos.
+        horns: how each servo is assembled.
     """
 
     def __init__(self, bus: Ax12Bus, config: Ax12Config, horns: tuple[Horn, Horn] = (AS_SET, AS_SET)) -> None:
@@ -317,10 +318,7 @@ class TrueJoints:
 
 
 def emulated(setup: EmulatorSetup) -> Ax12Bus:
-    """Create both units below a simulated truck's lidar, at rest with the lidar parallel to the body.
-
-    The line has its real speed.
-    """
+    """Create both units under a simulated truck's lidar, at rest and parallel to the body, with the real bus speed."""
     config: Ax12Config = setup.settings or Ax12Config()
     joints, horns = (config.pitch, config.roll), setup.physics.horns()
     real = {joint.id: really(joint, horn) for joint, horn in zip(joints, horns, strict=True)}

@@ -1,4 +1,4 @@
-"""Find and read the units on the bus, without motion."""
+"""Find and read the units on the bus without moving them."""
 
 from monstertruck_drivers.ax12 import protocol as p
 from monstertruck_drivers.ax12.config import Ax12Config
@@ -13,15 +13,15 @@ IDS = range(1, 7)
 
 
 async def identify(link: Link, clock: Clock, settings: Ax12Config) -> dict[str, object]:
-    """Ping units 1 to 6 at 1 Mbaud and read settings and state of the units that answer.
+    """Ping units 1 to 6 at 1 Mbaud and read the settings and state of each unit that answers.
 
     Returns:
-        JSON-able: ``echo`` of the adapter, ``units``: per unit its id, model, firmware, limits,
-        status level, error names, position in steps, voltage, temperature and torque settings.
+        JSON-compatible dict: ``echo`` (whether the adapter echoes) and ``units``, with each unit's id, model, firmware,
+        limits, status level, error names, position in steps, voltage, temperature and torque settings.
 
     Raises:
-        DeviceTimeoutError: silence; the text names what to check.
-        WrongDeviceError: bytes, but no unit.
+        DeviceTimeoutError: nothing answered; the message names what to check.
+        WrongDeviceError: bytes arrived, but not from an AX-12A.
     """
     session = Ax12Session(link, clock, settings.timeout)
     await session.find_echo(*IDS)

@@ -1,4 +1,4 @@
-"""Bytes of the Dynamixel protocol 1.0 and the control table of the AX-12A.
+"""Dynamixel protocol 1.0 packets and the AX-12A control table.
 
 Source: manufacturer's e-manual, "DYNAMIXEL Protocol 1.0" and "AX-12A" (control table, units, error bits).
 """
@@ -34,7 +34,7 @@ DELAY_UNIT: Final = 2e-6
 
 
 class Instruction(IntEnum):
-    """Instruction of a request."""
+    """Instruction code of a request."""
 
     PING = 0x01
     READ = 0x02
@@ -59,7 +59,7 @@ class Alarm(IntFlag):
 
 
 def alarm_names(bits: int) -> str:
-    """Names of the set bits, joined; an unknown bit as hexadecimal."""
+    """Names of the set bits, joined; unknown bits are given in hexadecimal."""
     names = [(bit.name or "").lower() for bit in Alarm if bits & bit]
     unknown = bits & ~sum(Alarm)
     return "+".join([*names, hex(unknown)] if unknown else names) or "none"
@@ -78,15 +78,15 @@ class Register:
 
     @property
     def is_stored(self) -> bool:
-        """Whether it is stored in EEPROM."""
+        """Whether the register is stored in EEPROM."""
         return self.address < RAM_START
 
     def encode(self, value: int) -> bytes:
-        """Little-endian bytes."""
+        """Encode a value as little-endian bytes."""
         return value.to_bytes(self.size, "little")
 
     def decode(self, table: bytes | bytearray) -> int:
-        """Value of this register in a whole control table."""
+        """Value of this register in a complete control table."""
         return int.from_bytes(table[self.address : self.address + self.size], "little")
 
 
@@ -135,7 +135,7 @@ PRESENT_SIZE: Final = 8
 
 
 def slope_of(value: int) -> int:
-    """Compliance slope in steps: seven bands, 2 to 128."""
+    """Compliance slope in steps: one of seven values, 2 to 128."""
     return 1 << max(1, min(value, 254).bit_length() - 1) if value > 3 else 2
 
 
@@ -146,7 +146,7 @@ def from_sign_bit(code: int) -> int:
 
 
 def to_sign_bit(value: int) -> int:
-    """Word of a signed speed or load, limited to 1023."""
+    """Register word for a signed speed or load; its magnitude is limited to 1023."""
     magnitude = min(abs(value), WORD_SIGN - 1)
     return magnitude | WORD_SIGN if value < 0 else magnitude
 
@@ -176,13 +176,13 @@ class Present:
 
 
 def checksum(body: bytes) -> int:
-    """Checksum over everything between header and checksum."""
+    """Checksum of all bytes between the header and the checksum."""
     return ~sum(body) & 0xFF
 
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """A request (``code`` is an instruction) or a status (``code`` contains error bits)."""
+    """A request packet (``code`` is an instruction) or a status packet (``code`` contains error bits)."""
 
     unit: int
     code: int
@@ -214,10 +214,10 @@ def sync_write(start: Register, data: Mapping[int, bytes]) -> bytes:
 
     Args:
         start: first register.
-        data: bytes per unit, all of the same length.
+        data: bytes for each unit, all of the same length.
 
     Raises:
-        ValueError: no unit, or lengths that differ.
+        ValueError: no units, or the lengths differ.
     """
     lengths = {len(value) for value in data.values()}
     if len(lengths) != 1:
@@ -229,11 +229,11 @@ def sync_write(start: Register, data: Mapping[int, bytes]) -> bytes:
 class Ax12Parser:
     """Extracts packets from a byte stream in any fragmentation; buffers at most one packet.
 
-    The protocol has no byte stuffing: a header may occur inside parameters. The parser therefore takes packets by
-    length and verifies their sum; after a failure it continues the search one byte further.
+    The protocol has no byte stuffing: a header may occur inside parameters. The parser therefore delimits packets by
+    their length and verifies their checksum; after a failure it resumes the search one byte later.
 
     Args:
-        longest: maximum valid length byte.
+        longest: largest valid length byte.
     """
 
     def __init__(self, longest: int = LONGEST_PACKET) -> None:
@@ -243,7 +243,7 @@ class Ax12Parser:
         self._buffer = bytearray()
 
     def __len__(self) -> int:
-        """Buffered bytes."""
+        """Number of buffered bytes."""
         return len(self._buffer)
 
     def feed(self, data: bytes) -> list[Packet]:

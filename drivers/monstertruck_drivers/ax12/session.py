@@ -15,7 +15,7 @@ RETRIES: Final = 2
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """Content of a status packet."""
+    """Contents of a status packet."""
 
     error: Alarm
     data: bytes
@@ -24,14 +24,14 @@ class Answer:
 class Ax12Session:
     """One session; only the host initiates exchanges.
 
-    A passive adapter echoes every sent byte. An echoed request looks like a valid status packet. So the session
-    determines once whether there is an echo, by a request that no answer resembles, and then drops the echo in each
-    exchange.
+    A passive adapter echoes every sent byte. An echoed request looks like a valid status packet. The session therefore
+    determines once whether the adapter echoes, using a request that no answer resembles, and then drops the echo in
+    each exchange.
 
     Args:
         link: open link to the adapter.
         clock: time.
-        timeout: returns the timeout of an exchange of a number of bytes at a baud rate (s).
+        timeout: returns the timeout (s) for exchanging a number of bytes at a baud rate.
     """
 
     def __init__(self, link: Link, clock: Clock, timeout: Callable[[int, int], float]) -> None:
@@ -53,7 +53,7 @@ class Ax12Session:
         """Determine whether the adapter echoes; any of ``units`` may be absent.
 
         Raises:
-            DeviceLostError: unplugged.
+            DeviceLostError: the adapter was unplugged.
         """
         for unit in units:
             # The answer contains three bytes, its echo two.
@@ -67,8 +67,8 @@ class Ax12Session:
         """Ping a unit; return its error bits.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: silence, or no correct answer.
+            DeviceLostError: the adapter was unplugged.
+            DeviceTimeoutError: no answer, or no valid one.
         """
         return (await self._ask(unit, protocol.ping(unit), 0, retries)).error
 
@@ -76,8 +76,8 @@ class Ax12Session:
         """Read ``count`` bytes of the control table.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: silence, or no correct answer.
+            DeviceLostError: the adapter was unplugged.
+            DeviceTimeoutError: no answer, or no valid one.
             ProtocolError: the unit refused.
         """
         return await self._ask(unit, protocol.read(unit, start, count), count, retries)
@@ -86,8 +86,8 @@ class Ax12Session:
         """Write to the control table and wait for the answer.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: silence, or no correct answer.
+            DeviceLostError: the adapter was unplugged.
+            DeviceTimeoutError: no answer, or no valid one.
             ProtocolError: the unit refused.
         """
         answer = await self._ask(unit, protocol.write(unit, start, data), 0, retries)
@@ -102,7 +102,7 @@ class Ax12Session:
         """Write to several units in one packet; there is no answer.
 
         Raises:
-            DeviceLostError: unplugged.
+            DeviceLostError: the adapter was unplugged.
         """
         await self._clock.sleep_until(self._quiet_until)
         packet = protocol.sync_write(start, data)
@@ -132,7 +132,7 @@ class Ax12Session:
         raise DeviceTimeoutError(f"{self._link.name}: unit {unit}: no correct answer")
 
     async def _catch_up(self, unit: int) -> bool:
-        """Send a ping, whose answer has no data: answers arrive in order, so late answers arrive before it."""
+        """Send a ping and wait for its answer: answers arrive in order, so any late ones arrive before it."""
 
         def wanted(packet: Packet) -> bool:
             return packet.unit == unit and not packet.params
@@ -148,7 +148,7 @@ class Ax12Session:
         Args:
             request: encoded packet.
             count: number of data bytes in the answer.
-            wanted: distinguishes the answer from late ones to earlier requests.
+            wanted: distinguishes the answer from late answers to earlier requests.
         """
         await self._clock.sleep_until(self._quiet_until)
         self._link.discard()

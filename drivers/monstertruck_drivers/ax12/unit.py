@@ -1,4 +1,4 @@
-"""One emulated AX-12A: control table, control loop, heat and alarms."""
+"""One emulated AX-12A: control table, control loop, temperature and alarms."""
 
 from collections import deque
 from collections.abc import Callable
@@ -36,7 +36,7 @@ ORDERED: Final = {
 
 
 def unit_signals(number: int) -> dict[str, SignalKind]:
-    """Return the signals of a unit; ``number`` is its position on the bus, from 1 on."""
+    """Return a unit's signals; ``number`` is its position on the bus, counted from 1."""
     kinds = {f"{name}_{number}": SignalKind.NUMBER for name in REPORTED}
     return kinds | {f"{name}_{number}": SignalKind.ORDER for name in ORDERED.values()}
 
@@ -50,19 +50,19 @@ NO_ALARM: Final = Alarm(0)
 
 
 class Unit:
-    """Device side of one servo; time advances when its state is read.
+    """One emulated servo; its simulated time advances when its state is read.
 
     The shaft moves to the goal at a speed proportional to the drive. The drive rises over the compliance slope beyond
     the margin, is at least the punch, and is limited by torque limit and moving speed. A load slows the shaft down.
 
     Args:
-        ident: number on the bus.
-        position: position of the shaft (steps).
+        ident: id on the bus.
+        position: initial shaft position (steps).
         time_ns: current time.
         load: load on the shaft.
         voltage: supply voltage.
         signals: signals of the whole bus.
-        number: position on the bus, from 1; the suffix of its signals.
+        number: position on the bus, counted from 1; the suffix of its signal names.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class Unit:
         return self._values[register.address]
 
     def put(self, register: Register, value: int) -> None:
-        """Set a register, whatever its access."""
+        """Set a register regardless of its access rights."""
         self._table[register.address : register.address + register.size] = register.encode(value)
         self._values[register.address] = value
 
@@ -150,7 +150,7 @@ class Unit:
             self._overload_for = 0.0
 
     def register(self, address: int, data: bytes) -> Alarm:
-        """Keep a write for the next ``act``."""
+        """Store a write to execute at the next ``act``."""
         error = self._refusal(address, data)
         if not error:
             self._pending = (address, data)
@@ -158,7 +158,7 @@ class Unit:
         return error
 
     def act(self, time_ns: int) -> Alarm:
-        """Execute the registered write."""
+        """Execute the stored write."""
         if self._pending is None:
             return Alarm.INSTRUCTION
         (address, data), self._pending = self._pending, None
@@ -166,7 +166,7 @@ class Unit:
         return self.write(address, data, time_ns)
 
     def factory_reset(self) -> None:
-        """Set every register to its default, including the id 1."""
+        """Reset every register to its default, including the id (1)."""
         for register in p.REGISTERS:
             self.put(register, register.default)
         self._boot()
@@ -207,7 +207,7 @@ class Unit:
 
     @property
     def wheel_mode(self) -> bool:
-        """Whether it is in endless-turn mode: both limits are 0."""
+        """Whether the unit is in endless-turn mode: both angle limits are 0."""
         return not self.get(p.CW_LIMIT) and not self.get(p.CCW_LIMIT)
 
     def _refresh(self) -> None:
@@ -255,7 +255,7 @@ class Unit:
     # Motion
 
     def angles(self, times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Shaft position at times within the last seconds, or the nearest known one (steps)."""
+        """Shaft positions (steps) at times within the last few seconds; otherwise the nearest known position."""
         self.advance(int(times_ns.max()))
         if times_ns.min() >= self._time:
             return np.full(times_ns.shape, self.position)
@@ -352,7 +352,7 @@ class Unit:
 
 
 def steady_voltage(_: int) -> float:
-    """Supply voltage of a good 12 V converter."""
+    """Supply voltage from an ideal 12 V converter."""
     return 11.1
 
 

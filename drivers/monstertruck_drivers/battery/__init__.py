@@ -1,1 +1,1 @@
-"""The truck's battery: monitoring shared by all measuring devices, and a source on Linux IIO converters."""
+"""The truck's battery: monitoring shared by all devices that measure it, and a driver for Linux IIO converters."""

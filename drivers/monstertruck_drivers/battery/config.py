@@ -1,4 +1,4 @@
-"""Battery settings: the pack, its limits for low, critical and overcharged, and the measuring converter."""
+"""Battery settings: the pack, its low, critical and overcharged limits, and the converter that measures it."""
 
 from itertools import pairwise
 from typing import Annotated, Literal, Self
@@ -14,9 +14,9 @@ Seconds = Annotated[float, Field(ge=0, le=60)]
 class PackConfig(Schema):
     """Lithium-polymer pack and its limits; the default is 6S.
 
-    Low, critical, clear and overcharged are compared with the voltage at rest (the measured voltage plus the sag from
-    the motor's current), collapsed with the measured voltage. Calibrate the voltage scale: an error of 5 % makes a full
-    pack look overcharged.
+    The low, critical, clear and overcharged limits apply to the resting voltage (the measured voltage plus the sag
+    caused by the motor current); the collapsed limit applies to the measured voltage. Calibrate the voltage scale: an
+    error of 5 % makes a full pack look overcharged.
     """
 
     cells: Annotated[int, Field(ge=1, le=14)] = 6
@@ -77,11 +77,11 @@ class PackConfig(Schema):
 
 
 class IioConfig(PackConfig):
-    """Pack voltage behind a divider on a channel of a Linux Industrial-IO converter."""
+    """Pack voltage measured through a divider on a channel of a Linux Industrial-IO converter."""
 
     kind: Literal["iio"] = "iio"
     device: str = ""
-    """Name of the converter (file ``name``), such as ads1015; empty: the only one"""
+    """Name of the converter (contents of its file ``name``), such as ads1015; empty selects the only converter"""
     channel: Annotated[int, Field(ge=0, le=63)] = 0
     """Channel number N of in_voltageN_raw"""
     divider: Annotated[float, Field(gt=0)] = 10.0

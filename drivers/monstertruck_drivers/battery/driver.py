@@ -1,4 +1,4 @@
-"""Battery driver on a Linux IIO converter."""
+"""Battery driver for a Linux IIO converter."""
 
 from typing import Any
 
@@ -18,11 +18,12 @@ class IioBatteryDriver:
 
     Args:
         config: pack, converter, divider.
-        computer: computer with the converter; files are read off the loop, as an I2C conversion takes milliseconds.
+        computer: computer with the converter; its files are read in a thread, because an I2C conversion takes
+            milliseconds.
         clock: time.
         out: battery messages.
         events: changes of the battery's level.
-        drive: motor feedback, whose current explains the sag; None: not used.
+        drive: motor feedback, whose current explains the sag; None to ignore the sag.
         name: service name.
     """
 
@@ -48,10 +49,11 @@ class IioBatteryDriver:
 
         Raises:
             DeviceLostError: the converter is missing or has disappeared.
-            DeviceMismatchError: the converter lacks the channel, or there are several and none is configured.
-            DeviceTimeoutError: it does not answer, three readings in a row.
-            ProtocolError: the converter returned no number, three readings in a row.
-            PortBusyError: another process streams from it.
+            DeviceMismatchError: the converter lacks the channel, or there are several converters and none is
+                configured.
+            DeviceTimeoutError: three consecutive readings got no answer.
+            ProtocolError: three consecutive readings were not a number.
+            PortBusyError: another process is streaming from it.
         """
         channel = await self._offload(self._find)
         await self._offload(channel.read)
@@ -77,7 +79,7 @@ async def identify(computer: Computer, clock: Clock, settings: IioConfig) -> dic
     """Read every voltage input of every converter once.
 
     Returns:
-        JSON-compatible: ``converters`` with name, path, and for each channel the reading and the pin voltage, or the
+        JSON-compatible dict: ``converters`` with name, path, and for each channel the reading and pin voltage, or the
         error.
     """
     root = computer.root / iio.CONVERTERS

@@ -1,4 +1,4 @@
-"""Sysfs files of a converter with the battery's divider on one channel."""
+"""Sysfs files of a converter with the battery divider connected to one channel."""
 
 from collections.abc import Callable
 from functools import partial
@@ -20,7 +20,7 @@ COUNTS: Final = "counts"
 
 
 class IioEmulator(FaultyDevice):
-    """A 12-bit converter, 1 mV per count, as the kernel presents it.
+    """An emulated 12-bit converter, 1 mV per count, as the kernel presents it.
 
     Faults (``inject``): ``zero on|off`` (upper resistor open), ``full on|off`` (lower resistor open), ``freeze
     on|off``, ``garbage on|off``, ``bounce [SECONDS]`` (0 for 50 ms), ``noise LSB``, ``volts V`` (at the pin,
@@ -30,9 +30,9 @@ class IioEmulator(FaultyDevice):
         root: folder that replaces /.
         clock: time.
         source: pin voltage at a time (ns), V.
-        seed: seed of the noise.
-        channel: channel of the divider.
-        device: name of the converter.
+        seed: noise seed.
+        channel: channel that the divider is connected to.
+        device: converter name.
     """
 
     FULL_SCALE: Final = 4095
@@ -120,7 +120,7 @@ class IioEmulator(FaultyDevice):
 
 
 def emulated(setup: EmulatorSetup) -> IioEmulator:
-    """Create the converter at the battery of a simulated truck."""
+    """Create the converter that measures a simulated truck's battery."""
     config: IioConfig = setup.settings or IioConfig()
     device = config.device or "mcp3208"
     return IioEmulator(

@@ -1,4 +1,4 @@
-"""Voltages of Linux Industrial-IO converters, read from sysfs; every function blocks and must run in a thread.
+"""Voltages from Linux Industrial-IO converters, read from sysfs; every function blocks and must run in a thread.
 
 Source: kernel documentation, ABI/testing/sysfs-bus-iio: a voltage in millivolts is (raw + offset) * scale, where
 offset and scale may be given per channel or for all.
@@ -34,7 +34,7 @@ class Converter:
     name: str
 
     def channels(self) -> list[int]:
-        """Numbers of its voltage inputs."""
+        """Numbers of the converter's voltage inputs."""
         return sorted(
             int(file.name[10:-4]) for file in self.path.glob("in_voltage[0-9]*_raw") if file.name[10:-4].isdecimal()
         )
@@ -53,7 +53,7 @@ class Channel:
     """Maximum reading, counts; None: unknown."""
 
     def read(self) -> int:
-        """Raw reading, counts.
+        """Read the raw value (counts).
 
         Raises:
             DeviceError: see ``read_text``.
@@ -66,7 +66,7 @@ class Channel:
         return (raw + self.offset) * self.scale / 1000
 
     def at_limit(self, raw: int) -> bool:
-        """Whether the reading is at an end of the scale."""
+        """Whether a raw reading is 0 or full scale."""
         return raw <= 0 or (self.full_scale is not None and raw >= self.full_scale)
 
 
@@ -82,7 +82,7 @@ def converters(root: Path = ROOT) -> list[Converter]:
 
 
 def find(root: Path, name: str) -> Converter:
-    """Find the converter of that name, or the only one if ``name`` is empty.
+    """Find the converter with that name, or the only one if ``name`` is empty.
 
     Raises:
         DeviceLostError: no converter found.
@@ -119,10 +119,10 @@ def channel(converter: Converter, number: int, full_scale: int | None = None) ->
 
 
 def read_text(file: Path) -> str:
-    """Content of a small file.
+    """Read the contents of a small file.
 
     Raises:
-        DeviceLostError: it or its device is gone.
+        DeviceLostError: the file or its device is gone.
         PortBusyError: the converter streams to another process.
         DeviceTimeoutError: the converter does not answer the kernel.
         DeviceError: any other failure.
@@ -149,7 +149,7 @@ def _number(file: Path) -> float:
 
 
 def _shared(folder: Path, stem: str, attribute: str) -> float | None:
-    """Return an attribute of a channel, or the attribute that all voltage channels share."""
+    """Return a channel's own attribute, or the one that all voltage channels share."""
     for file in (folder / f"{stem}_{attribute}", folder / f"in_voltage_{attribute}"):
         if file.exists():
             return _number(file)

@@ -32,14 +32,14 @@ _CHARGES: Final = np.linspace(0.0, 1.0, len(CELL_VOLTS))
 def charge_of(cell_volts: float) -> float:
     """Remaining charge at a resting cell voltage, 0..1.
 
-    Between 20 and 60 % a cell changes by 8 to 35 mV per 5 %, less than a 10-bit converter resolves behind a divider for
-    six cells. The result is no more accurate than +-0.1.
+    Between 20 and 60 % a cell changes by 8 to 35 mV per 5 %, which is below the resolution of a 10-bit converter behind
+    a six-cell divider. The result is no more accurate than +-0.1.
     """
     return float(np.interp(cell_volts, CELL_VOLTS, _CHARGES))
 
 
 class BatteryVerdict(NamedTuple):
-    """State of the battery after a sample."""
+    """Battery state after a sample."""
 
     level: BatteryLevel
     voltage: float | None = None
@@ -72,9 +72,10 @@ class BatteryJudge:
 
         Args:
             time_ns: time of the sample; must not decrease.
-            voltage: pack voltage (V); NaN: the converter was at an end of its scale.
-            current: motor current (A), either sign; None: unknown, no sag is removed. The pack current is smaller at
-                low motor speed, and includes the electronics: both effects are within the table's error.
+            voltage: pack voltage (V); NaN if the converter read 0 or full scale.
+            current: motor current (A), either sign; None if unknown: the sag is not compensated. The pack current is
+                smaller at low motor speed, and includes the electronics: both effects are smaller than the table's
+                error.
         """
         elapsed = 0 if self._last is None else time_ns - self._last
         if elapsed > GAP:
@@ -133,14 +134,14 @@ LEVEL_EVENTS: Final = {
 
 
 class BatteryMonitor:
-    """Judges and publishes samples; outlives the sessions of the driver that provides them.
+    """Judges and publishes samples; it outlives the sessions of the driver that provides the samples.
 
     Args:
         config: the pack.
         out: sink of battery messages.
         events: sink of events, one for every change of the level.
-        source: source name of the events.
-        drive: motor feedback for the sag; None: the voltage is judged as measured.
+        source: source name in the events.
+        drive: motor feedback used to compensate for sag; None: the measured voltage is used uncompensated.
     """
 
     def __init__(
@@ -164,12 +165,12 @@ class BatteryMonitor:
     def take(
         self, stamp: int, received: int, volts: float, *, at_limit: bool = False, current: float | None = None
     ) -> None:
-        """Process one voltage sample (V).
+        """Process one voltage sample.
 
         Args:
             stamp: time of the sample (ns).
-            received: time of its arrival (ns).
-            volts: voltage of the pack.
+            received: arrival time of the sample (ns).
+            volts: pack voltage (V).
             at_limit: whether the converter reads 0 or full scale, because a wire of the divider is disconnected.
             current: current into the pack (A); None if not measured.
         """

@@ -1,4 +1,4 @@
-"""Settings of the BNO085."""
+"""Settings for the BNO085."""
 
 from typing import Annotated, Literal
 

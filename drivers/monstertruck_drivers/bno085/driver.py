@@ -1,4 +1,4 @@
-"""Driver of the BNO085: converts frames to tilt, turn rates and specific forces."""
+"""BNO085 driver: converts frames to tilt, turn rates and specific forces."""
 
 from math import cos, degrees, hypot, pi, sin, tau
 from typing import Final
@@ -20,9 +20,10 @@ LONGEST_GAP: Final = 10
 
 
 def body_rates(before: RvcFrame, after: RvcFrame) -> Xyz | None:
-    """Return the angular velocity between two frames (rad/s) in the unit's axes; None if they are equal or far apart.
+    """Return the turn rates between two frames (rad/s) in the unit's axes; None if they are identical or too far apart.
 
-    The time base is the unit's clock: the index gives the hundredths of a second between the frames.
+    The time base is the unit's clock: the difference of the indices is the time between the frames in hundredths of a
+    second.
     """
     steps = (after.number - before.number) % INDICES
     if not 0 < steps <= LONGEST_GAP:
@@ -42,13 +43,13 @@ class Bno085Driver:
     """Receives the unit's stream; the unit accepts no requests.
 
     Args:
-        config: averaging and checks.
-        port: port of the unit.
+        config: averaging and check settings.
+        port: the unit's port.
         clock: time.
         out: angular velocity and specific force, in the unit's axes.
-        attitude: tilt, with a heading relative to power-up that is marked as untrustworthy; None where a compass
-            measures it.
-        events: missing frames.
+        attitude: tilt; its heading, relative to power-up, is marked as untrustworthy. None if a compass measures the
+            attitude.
+        events: receives an event when frames are missing.
         name: name of the service and of the frame.
     """
 
@@ -74,10 +75,10 @@ class Bno085Driver:
         """Serve one session.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: silence.
-            ProtocolError: bytes without a frame, or repeated identical measurements.
-            WrongDeviceError: the bytes at the start contain no frame.
+            DeviceLostError: the unit was unplugged.
+            DeviceTimeoutError: no bytes arrive.
+            ProtocolError: bytes arrive without a valid frame, or identical measurements repeat.
+            WrongDeviceError: the first bytes contain no frame.
             PortBusyError: another process holds the port.
         """
         async with await self._port.open() as link:
@@ -144,7 +145,7 @@ class Bno085Driver:
 
 
 async def first_frames(stream: DeviceStream[RvcFrame]) -> list[RvcFrame]:
-    """Wait for the first frames of a session; raises the errors of ``DeviceStream.first``."""
+    """Wait for the first frames of a session. Raises the same errors as ``DeviceStream.first``."""
     listen = 1.0  # seconds to receive a frame at the start; the unit needs a few tenths after power-up
     return await stream.first(
         listen, "of a BNO085 in UART-RVC mode: another device, another baud rate, or PS0 and PS1 set for another mode"
@@ -155,10 +156,10 @@ async def identify(link: Link, clock: Clock, settings: Bno085Config) -> dict[str
     """Wait for one frame.
 
     Returns:
-        JSON-compatible: ``yaw_deg`` since power-up, ``pitch_deg``, ``roll_deg``, ``acceleration`` (m/s^2).
+        JSON-compatible dict: ``yaw_deg`` since power-up, ``pitch_deg``, ``roll_deg``, ``acceleration`` (m/s^2).
 
     Raises:
-        DeviceError: as for the driver's ``run``.
+        DeviceError: the same errors as from the driver's ``run``.
     """
     frame = (await first_frames(DeviceStream(link, clock, RvcParser().feed)))[-1]
     yaw, pitch, roll = (round(degrees(angle), 2) for angle in frame.angles)

@@ -1,6 +1,6 @@
-"""Device side of a BNO085 in UART-RVC mode, byte for byte.
+"""Emulated BNO085 in UART-RVC mode, byte for byte.
 
-Behaviour of the real unit: it streams from power-up and ignores input. Its heading is 0 at power-up and drifts. The
+Like the real unit, it streams from power-up and ignores input. Its heading is 0 at power-up and drifts. The
 accelerometer also measures the body's acceleration, which the unit's fusion removes from pitch and roll only slowly.
 """
 
@@ -24,14 +24,14 @@ REPORTED: Final = ("yaw", "pitch", "roll", "x", "y", "z")
 class Bno085Emulator(FaultyDevice):
     """Streaming unit.
 
-    Faults (``inject``): ``frozen on|off`` (repeats one measurement, the index continues), ``silent on|off``,
-    ``inverted on|off`` (yaw counts the other way), ``bad_checksum N`` (the next N frames), ``skip N`` (N frames are not
-    sent), ``half_frame``, ``reset``.
+    Faults (``inject``): ``frozen on|off`` (repeats one measurement, the index continues), ``silent on|off``, ``inverted
+    on|off`` (the sign of yaw is inverted), ``bad_checksum N`` (the next N frames), ``skip N`` (N frames are not sent),
+    ``half_frame``, ``reset``.
 
     Args:
         clock: time.
-        source: physics.
-        seed: seed of noise and drift.
+        source: physics to measure.
+        seed: seed for noise and drift.
     """
 
     def __init__(self, clock: Clock, source: ImuSource, *, seed: int = 0) -> None:
@@ -115,5 +115,5 @@ class Bno085Emulator(FaultyDevice):
 
 
 def emulated(setup: EmulatorSetup) -> Bno085Emulator:
-    """Create the unit of a simulated robot."""
+    """Create a simulated robot's unit."""
     return Bno085Emulator(setup.clock, setup.physics.imu, seed=setup.seed)

@@ -25,7 +25,7 @@ Xyz = tuple[float, float, float]
 
 
 class RvcFrame(NamedTuple):
-    """Raw numbers of one frame."""
+    """Raw values of one frame."""
 
     number: int
     """Index of the frame, which wraps at 256."""
@@ -50,24 +50,24 @@ class RvcFrame(NamedTuple):
 
 
 def build(frame: RvcFrame) -> bytes:
-    """Return the bytes of a frame.
+    """Encode a frame.
 
     Raises:
-        struct.error: a number exceeds its range.
+        struct.error: a value exceeds its range.
     """
     body = _BODY.pack(*frame)
     return HEADER + body + bytes((sum(body) & 0xFF,))
 
 
 def measured(index: int, angles: Xyz, acceleration: Xyz) -> RvcFrame:
-    """Return the frame of a measurement in rad and m/s^2, clipped to the unit's range."""
+    """Return the frame for a measurement in rad and m/s^2, clipped to the unit's range."""
     yaw, pitch, roll = (round(100 * degrees(angle)) for angle in angles)
     x, y, z = (max(-_MOST, min(_MOST, round(force / _FORCE))) for force in acceleration)
     return RvcFrame(index % INDICES, (yaw + 18_000) % 36_000 - 18_000, pitch, roll, x, y, z)
 
 
 class RvcParser:
-    """Extracts frames from bytes; counts the bytes outside of frames."""
+    """Extracts frames from a byte stream; counts the bytes outside frames."""
 
     def __init__(self) -> None:
         self.refused = 0

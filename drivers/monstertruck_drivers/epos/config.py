@@ -1,4 +1,4 @@
-"""Settings of the drive controller in the configuration file."""
+"""Drive controller settings in the configuration file."""
 
 import math
 from typing import Annotated, Literal
@@ -13,7 +13,7 @@ RpmPerSecond = Annotated[int, Field(gt=0, lt=2**31)]
 
 
 class EposConfig(Schema):
-    """Drive controller EPOS 24/1 in profile velocity mode.
+    """EPOS 24/1 drive controller in profile velocity mode.
 
     The defaults suit the truck: 18000 rpm are 0.22 m/s; 82000 rpm/s are 1 m/s^2 (ratio 644, wheel radius 75 mm).
     """
@@ -36,7 +36,7 @@ class EposConfig(Schema):
     """Quick stop deceleration (rpm/s): full speed to rest in 0.08 s."""
 
     encoder_pulses_per_turn: Annotated[int, Field(gt=0, le=65_535)] | None = 500
-    """Encoder pulses per motor turn (counts / 4); None: the controller's setting."""
+    """Encoder pulses per motor turn (counts / 4); None uses the controller's setting."""
     motor_type: Literal[1, 10, 11] | None = None
     """Motor type: 1 brushed DC, 10 sinusoidal EC, 11 block commutated EC; None: not checked."""
 
@@ -54,7 +54,7 @@ class EposConfig(Schema):
     """Speed below which the motor is at rest (rpm)."""
 
     fault_resets: Annotated[int, Field(ge=0, le=10)] = 3
-    """Maximum fault resets within ``fault_reset_window``; then the drive fails."""
+    """Maximum number of fault resets within ``fault_reset_window`` before the drive fails."""
     fault_reset_window: Seconds = 10.0
     """Time in which ``fault_resets`` are counted (s)."""
     fault_reset_pause: Seconds = 0.3
@@ -62,7 +62,7 @@ class EposConfig(Schema):
 
     @property
     def motor_limits(self) -> MotorLimits:
-        """Limits of the motor."""
+        """Motor limits."""
         rpm = 2 * math.pi / 60
         return MotorLimits(
             self.max_motor_rpm * rpm, self.deceleration_rpm_s * rpm, self.quick_stop_deceleration_rpm_s * rpm

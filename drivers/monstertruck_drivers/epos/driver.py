@@ -1,12 +1,13 @@
-"""Drive service: the EPOS 24/1 in profile velocity mode behind ``cmd/drive`` and ``sensor/drive``.
+"""Drive service: runs the EPOS 24/1 in profile velocity mode from ``cmd/drive`` and publishes ``sensor/drive``.
 
-All exchanges share one schedule. The driver checks the latest command before each exchange, so a stop waits at most for
-the exchange in flight. It repeats quick stop and power off after every velocity other than standstill, in case the
-controller missed the first one. Every cycle it compares the desired state with the statusword and sends one controlword
-that brings the controller a step closer: one loop enables, stops, runs after a quick stop and recovers from faults.
+All exchanges share one schedule. The driver checks the latest command before each exchange, so a stop waits no longer
+than the exchange in progress. It repeats quick stop and power off after every velocity other than standstill, in case
+the controller missed the first one. Every cycle it compares the desired state with the statusword and sends one
+controlword that brings the controller a step closer: one loop enables, stops, runs after a quick stop and recovers from
+faults.
 
 The controller keeps its last speed when the host goes silent. Every session therefore starts with a quick stop and ends
-with a quick stop and power stage off.
+with a quick stop and the power stage off.
 """
 
 import math
@@ -41,22 +42,22 @@ RAD_S_PER_RPM = 2 * math.pi / 60
 
 
 class Setpoint(NamedTuple):
-    """Desired state of the controller: a power state, and the target of ENABLED."""
+    """Desired controller state: a power state, and the target speed if ENABLED."""
 
     goal: State
     rpm: int = 0
 
 
 def setpoint_of(command: DriveCommand | None, now: int, config: EposConfig) -> Setpoint:
-    """Return the set-point of the latest command at ``now``; implements the host's deadman.
+    """Return the set-point for the latest command at ``now``; implements the host-side deadman.
 
     Args:
         command: latest command, if any.
-        now: time (ns).
+        now: current time (ns).
         config: sign, limits and timeouts.
 
     Returns:
-        ENABLED with a target in the controller's sign, QUICK_STOP, or SWITCH_ON_DISABLED.
+        ENABLED with a target in the controller's sign convention, QUICK_STOP, or SWITCH_ON_DISABLED.
     """
     if command is None or command.action is DriveAction.DISABLE:
         return Setpoint(State.SWITCH_ON_DISABLED)
@@ -70,7 +71,7 @@ def setpoint_of(command: DriveCommand | None, now: int, config: EposConfig) -> S
 
 
 def sign(config: EposConfig) -> int:
-    """Sign of driving forward at the controller."""
+    """Sign of the controller's speed when the truck drives forward."""
     return -1 if config.inverted else 1
 
 
@@ -98,12 +99,12 @@ class Odometer:
         """Latest position of the controller, and its time (ns)."""
 
     def update(self, raw: int, now: int, fastest: float) -> int:
-        """Add the motion since the last reading; an impossible step means that the counter was reset.
+        """Add the motion since the last reading; an impossibly large step means that the counter was reset.
 
         Args:
-            raw: position of the controller, signed 32 bits.
+            raw: controller position, signed 32-bit.
             now: time of the reading (ns).
-            fastest: maximum motor speed, counts/s.
+            fastest: maximum motor speed (counts/s).
 
         Returns:
             ``counts``.
@@ -118,7 +119,7 @@ class Odometer:
         return self.counts
 
     def restart(self) -> None:
-        """Continue at the next position, after the controller was off."""
+        """Continue from the next position after the controller was off."""
         self._last = None
 
 
@@ -137,16 +138,16 @@ QUICK_EXCHANGE = 0.02
 
 
 class EposDriver:
-    """Service of the drive controller.
+    """Drive controller service.
 
     Args:
         config: settings, see ``EposConfig``.
-        port: port of the controller.
+        port: the controller's port.
         clock: time.
-        commands: ``cmd/drive``; this driver is its only reader.
+        commands: ``cmd/drive``; this driver is the topic's only reader.
         out: ``sensor/drive``, with ``stamp`` in the middle of the exchange that read the position.
-        events: sink of events: identity of the controller, and faults.
-        name: name of the service.
+        events: event sink for the controller's identity and faults.
+        name: service name.
     """
 
     def __init__(
@@ -179,13 +180,13 @@ class EposDriver:
         """Run one session, from stopping a motor that may still turn to the stop at its end.
 
         Raises:
-            DeviceLostError: nothing plugged in; the link went down.
+            DeviceLostError: no controller is plugged in, or the link went down.
             DeviceRestartedError: the controller restarted.
             DeviceStoppedError: a motor that should turn was stopped by the deadman line or another master.
             PortBusyError: another process holds the port.
             WrongDeviceError: another device answers.
             DeviceMismatchError: motor or encoder data contradict the configuration.
-            DeviceFaultError: a fault that resets do not clear. DeviceTimeoutError, ProtocolError: no usable answers.
+            DeviceFaultError: resetting does not clear the fault. DeviceTimeoutError, ProtocolError: no usable answers.
         """
         async with await self._port.open() as link:
             line = Exchanger(link, self.clock, self.config.node, self._quiet_until)
@@ -203,7 +204,7 @@ class EposDriver:
 
 
 class _DriveSession:
-    """One connection: commands sent and latest state of the controller."""
+    """One connection: the commands sent and the controller's latest state."""
 
     def __init__(self, driver: EposDriver, line: Exchanger) -> None:
         self._driver = driver
@@ -275,10 +276,10 @@ class _DriveSession:
             raise
 
     async def _check_mark(self, attempts: int = 1) -> None:
-        """Detect a restarted controller by its lost mark, and mark it again.
+        """Detect a controller restart by the missing mark, and set the mark again.
 
         Args:
-            attempts: attempts of each exchange.
+            attempts: maximum attempts for each exchange.
 
         Raises:
             DeviceRestartedError: it restarted while in use.
@@ -300,10 +301,10 @@ class _DriveSession:
                 raise DeviceRestartedError("the controller restarted")
 
     async def make_safe(self) -> None:
-        """Brake, and switch the power stage off once the motor rests.
+        """Brake, and switch the power stage off once the motor is at rest.
 
-        Each of ``SAFE_ATTEMPTS`` attempts times out ``SAFE_TIME`` after a quick stop from full speed would have ended.
-        The time starts when the controller listens again: after a damaged or late answer it needs a silence.
+        Each of the ``SAFE_ATTEMPTS`` attempts times out ``SAFE_TIME`` after the end of a quick stop from full speed.
+        The timeout starts once the controller accepts commands again: after a damaged or late answer it needs a pause.
         """
         full_speed = self._config.max_motor_rpm / self._config.quick_stop_deceleration_rpm_s
         # Maximum wait for a quick stop (s), whatever its configured deceleration.
@@ -323,9 +324,9 @@ class _DriveSession:
             return
 
     async def _brake_and_switch_off(self, within: float) -> None:
-        """Repeat the quick stop until the motor rests, then switch off; in any case after ``within`` seconds.
+        """Repeat the quick stop until the motor is at rest or ``within`` seconds have passed, then switch it off.
 
-        A motor that has not stopped by then ignores the quick stop: without its power stage it coasts to rest.
+        A motor still turning after that time ignores quick stops; without its power stage it coasts to rest.
         """
         end = self._clock.now() + int(within * SECOND)
         while self._clock.now() <= end:
@@ -337,7 +338,7 @@ class _DriveSession:
     # The schedule
 
     async def serve(self, ready: Ready) -> None:
-        """Run cycles until cancelled; after a failed exchange the most urgent one follows."""
+        """Run cycles until cancelled; a failed exchange is followed by the most urgent one."""
         schedule = Schedule(self._clock, self._config.rate, Lead.POLLING)
         misses, reported_ready = Misses(BRIEF_SILENCES + 2), False  # the last one follows a long silence
         while True:
@@ -382,7 +383,7 @@ class _DriveSession:
         self._slow = median > (QUICK_EXCHANGE if self._slow else SLOW_EXCHANGE)
 
     async def _idle(self, until: int) -> None:
-        """Wait for the next cycle; a stop command is executed at once."""
+        """Wait for the next cycle, but execute a stop command immediately."""
         while (left := until - self._clock.now()) > 0:
             if await self._driver.commands.next_within(left / SECOND, lambda _: not self._is_urgent()) is None:
                 return
@@ -427,7 +428,7 @@ class _DriveSession:
     # Decision
 
     def _setpoint(self) -> Setpoint:
-        """Return the set-point of the latest valid command; without one a moving motor is braked, then switched off."""
+        """Return the latest valid command's set-point; without one, a moving motor is braked, then switched off."""
         command = self._driver.commands.latest
         if command is not None and command.stamp < self._commands_after:
             command = None
@@ -437,13 +438,13 @@ class _DriveSession:
 
     @property
     def _moves(self) -> bool:
-        """Whether the latest velocity shows a moving motor."""
+        """Whether the latest velocity reading shows that the motor is moving."""
         return abs(self._rpm) > self._config.standstill_rpm
 
     async def _act(self, *, also_faster: bool = False) -> None:
-        """Send urgent commands: a quick stop, power stage off, a lower target.
+        """Send urgent commands: quick stop, power stage off, or a lower target.
 
-        ``also_faster``: send a higher target as well, which happens only at the start of a cycle.
+        ``also_faster``: also send a higher target; this happens only at the start of a cycle.
         """
         setpoint = self._setpoint()
         if setpoint.goal is State.ENABLED:
@@ -465,7 +466,7 @@ class _DriveSession:
         return self._is_urgent_stop(setpoint) or _slower(self._target(setpoint), self._sent_rpm)
 
     def _is_urgent_stop(self, setpoint: Setpoint) -> bool:
-        """Whether a quick stop, or power off for a moving motor, has to be sent now."""
+        """Whether a quick stop, or power off for a moving motor, must be sent now."""
         if setpoint.goal is self._stopping or setpoint.goal is State.ENABLED:
             return False
         return setpoint.goal is State.QUICK_STOP or self._moves
@@ -474,7 +475,7 @@ class _DriveSession:
         return setpoint.rpm if self._state is State.ENABLED else 0
 
     async def _look(self) -> None:
-        """Read the power state and judge its changes."""
+        """Read the power state and evaluate its changes."""
         was, self._reported = self._reported, state_of(await self._read(od.STATUSWORD))
         self._state = self._reported
         if self._state in OFF and was not in OFF:
@@ -494,10 +495,10 @@ class _DriveSession:
             self._driver.reported_fault = None
 
     def _judge_foreign_stop(self) -> None:
-        """End the session if the motor should turn: a motor stopped by another client must not restart at once.
+        """End the session if the motor should turn: a motor stopped by another client must not restart immediately.
 
         Raises:
-            DeviceStoppedError: the motor should turn.
+            DeviceStoppedError: the motor was stopped although it should turn.
         """
         if self._setpoint().rpm != 0:
             text = "quick stop not ordered by this program: the deadman line fell, or a second master sends commands"
@@ -505,7 +506,7 @@ class _DriveSession:
             raise DeviceStoppedError(text)
 
     async def _step(self, goal: State) -> None:
-        """Send one controlword towards ``goal``."""
+        """Send one controlword that moves the state towards ``goal``."""
         now = self._clock.now()
         if goal is not self._goal or settled(self._state, goal) or self._state in FAULTED:
             self._goal, self._goal_since, self._late_reported = goal, now, False
@@ -534,7 +535,7 @@ class _DriveSession:
                 raise
 
     async def _prepare(self) -> None:
-        """Set mode, limits and ramps, which a controller loses without power.
+        """Set the mode, limits and ramps, which the controller loses at power-off.
 
         Raises:
             ProtocolError: the controller rejects the mode.
@@ -576,10 +577,10 @@ class _DriveSession:
         return [await self._read(entry) & 0xFFFF for entry in od.ERROR_HISTORY[:count]]
 
     async def _reset_fault(self, now: int, code: int) -> None:
-        """Reset a fault once, by an edge of the reset bit.
+        """Reset a fault once, with an edge on the reset bit.
 
         Raises:
-            DeviceFaultError: too many recent resets.
+            DeviceFaultError: there were too many resets recently.
         """
         window = int(self._config.fault_reset_window * SECOND)
         recent = [instant for instant in self._driver.resets if now - instant < window]

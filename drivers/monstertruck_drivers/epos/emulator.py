@@ -1,6 +1,6 @@
-"""Device side of the EPOS 24/1, byte for byte, with faults on request.
+"""Emulated EPOS 24/1, byte for byte, with faults on request.
 
-Keeps its last speed when the host goes silent: RS232 has no host watchdog.
+It keeps its last speed when the host goes silent, because there is no host watchdog over RS232.
 """
 
 import asyncio
@@ -51,17 +51,17 @@ class EposEmulator(FaultyDevice):
     Faults (``inject``): ``fault CODE|NAME [passing]``: into FAULT; the cause stays until ``clear`` unless passing.
     ``busy``, ``refuse``, ``flip``, ``stray`` ``[COUNT]``: opcodes refused, frames refused, answers with a wrong bit,
     bytes before acknowledges. ``acknowledge``, ``length`` ``[COUNT]``: acknowledges, and length bytes from the host,
-    damaged on the line. ``restart [COUNT]``: the supply fails for a moment before the next answers.
-    ``delay MS [COUNT]``: late answers. ``silent``, ``power``, ``line`` (quick stop input),
-    ``strict`` (impossible controlwords are errors), ``repeat`` (refused answers come again), ``latch`` (quick stop
-    is left through power stage off only): ``on|off``.
-    ``supply_limit VOLTS``: over-voltage above that. ``runaway``: see ``DisobedientMotor``.
+    damaged on the line. ``restart [COUNT]``: the supply fails briefly before the next answers. ``delay MS [COUNT]``:
+    late answers. ``silent``, ``power``, ``line`` (quick stop input), ``strict`` (impossible controlwords are errors),
+    ``repeat`` (refused answers come again), ``latch`` (quick stop is left through power stage off only): ``on|off``.
+    ``supply_limit VOLTS``: supply voltage above which the over-voltage fault occurs. ``runaway``: see
+    ``DisobedientMotor``.
 
     Args:
         clock: time.
-        motor: shaft and load; None: a separate free motor.
-        seed: seed of delays and noise.
-        node: its node id (in addition to 0).
+        motor: shaft and load; None for an unloaded motor of its own.
+        seed: seed for delays and noise.
+        node: the controller's node id (it also answers to 0).
     """
 
     def __init__(self, clock: Clock, motor: MotorPlant | None = None, *, seed: int = 0, node: int = 1) -> None:
@@ -104,12 +104,12 @@ class EposEmulator(FaultyDevice):
     # Faults and switches
 
     def power_cycle(self) -> None:
-        """Switch the supply off and on: it returns switch-on disabled, with target 0 and stored settings."""
+        """Switch the supply off and on: it returns in "switch-on disabled", with target 0 and stored settings."""
         self._switch_power(False)
         self._switch_power(True)
 
     def set_quick_stop_input(self, active: bool) -> None:
-        """Hardware deadman line on a digital input: while active the controller stops by itself."""
+        """Set the hardware deadman line at the digital input: while it is active, the controller stops the motor."""
         self.firmware.set_quick_stop_input(active)
 
     def _inject_fault(self, name: str, *passing: str) -> None:
@@ -241,7 +241,7 @@ class EposEmulator(FaultyDevice):
         end.write(data, turn_around)
 
     async def _within(self, end: DeviceEnd, count: int) -> bytes:
-        """Bytes of a frame; a pause that is too long raises ``TimeoutError``."""
+        """Read the bytes of a frame; an overlong pause raises ``TimeoutError``."""
         return await self._take(end, count, self.firmware.frame_timeout)
 
     async def _take(self, end: DeviceEnd, count: int, pause: float | None = None) -> bytes:
@@ -292,12 +292,12 @@ class EposEmulator(FaultyDevice):
 
     @property
     def state(self) -> State:
-        """Power state at the latest update."""
+        """Power state as of the latest update."""
         return self.firmware.state
 
 
 def emulated(setup: EmulatorSetup) -> EposEmulator:
-    """Create the controller of one driven shaft of a simulated truck, on a line of realistic speed."""
+    """Create the controller for one driven shaft of a simulated truck, with a realistic line speed."""
     shaft = SHAFTS.index(DeviceRole(setup.role))
     setup.port.device.baud = EPOS_BAUD
     return EposEmulator(setup.clock, setup.physics.motors[shaft], seed=setup.seed + shaft)

@@ -1,4 +1,4 @@
-"""Byte handshake of the EPOS over a link: one exchange at a time, with timeouts and recovery."""
+"""EPOS byte handshake over a link: one exchange at a time, with timeouts and recovery."""
 
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -72,7 +72,7 @@ class Exchanger:
         link: open link to the controller.
         clock: time.
         node: node id.
-        quiet_until: end of the silence required by an earlier link (ns).
+        quiet_until: time until which an earlier link requires silence (ns).
     """
 
     def __init__(self, link: Link, clock: Clock, node: int, quiet_until: int = 0) -> None:
@@ -109,19 +109,19 @@ class Exchanger:
         """Read the value of an object.
 
         Raises:
-            ObjectError: the controller refuses. DeviceTimeoutError, ProtocolError: no usable answer in ``attempts``
-            tries.
+            ObjectError: the controller refuses the request.
+            DeviceTimeoutError, ProtocolError: no usable answer in ``attempts`` tries.
             DeviceLostError: the link is down.
         """
         return self._value(entry, await self._answer(read_request(entry, self._node), entry, attempts))
 
     async def read_row(self, entries: Sequence[ObjectEntry], take: Callable[[int], bool]) -> None:
-        """Read objects back to back, pass each value to ``take`` at once, and stop when it returns False.
+        """Read objects back to back, pass each value to ``take`` immediately, and stop when it returns False.
 
-        The row also ends when its reader is gone.
+        Reading also stops when the caller has been cancelled.
 
         Raises:
-            ObjectError, DeviceTimeoutError, ProtocolError, DeviceLostError: as ``read``.
+            ObjectError, DeviceTimeoutError, ProtocolError, DeviceLostError: the same as ``read``.
         """
         await self._transact(self._run_row(entries, take))
 
@@ -130,7 +130,7 @@ class Exchanger:
 
         Raises:
             ValueError: ``value`` does not fit the object.
-            ObjectError, DeviceTimeoutError, ProtocolError, DeviceLostError: as ``read``.
+            ObjectError, DeviceTimeoutError, ProtocolError, DeviceLostError: the same as ``read``.
         """
         await self._answer(write_request(entry, value, self._node), entry, attempts, value)
 
@@ -138,7 +138,7 @@ class Exchanger:
         """Make the controller drop incomplete frames sooner, if supported, so that a corrupted byte costs less time.
 
         Raises:
-            DeviceTimeoutError, ProtocolError, DeviceLostError: as ``read``.
+            DeviceTimeoutError, ProtocolError, DeviceLostError: the same as ``read``.
         """
         quick = max(self.durations, default=SECOND) <= QUICK_ANSWER * SECOND
         # Timeout of an incomplete frame set by the host on a fast line: no valid frame takes longer.
@@ -151,10 +151,10 @@ class Exchanger:
             self._frame_timeout = milliseconds / 1000
 
     async def read_long(self, entry: ObjectEntry) -> bytes:
-        """Read the raw bytes of an object of more than 32 bits, by segments.
+        """Read the raw bytes of an object longer than 32 bits, segment by segment.
 
         Raises:
-            ObjectError, DeviceTimeoutError, ProtocolError, DeviceLostError: as ``read``.
+            ObjectError, DeviceTimeoutError, ProtocolError, DeviceLostError: the same as ``read``.
         """
         await self._answer(segmented_read_request(entry, self._node), entry, 1)
         data, toggle = b"", False
@@ -215,7 +215,7 @@ class Exchanger:
                 self._flight = None  # its error's traceback holds this exchanger
 
     async def settle(self) -> None:
-        """Make the controller drop an incomplete frame, by silence on the line from both sides.
+        """Make the controller drop an incomplete frame by keeping both sides of the line silent.
 
         Raises:
             DeviceLostError: the link went down.
@@ -232,12 +232,12 @@ class Exchanger:
         self._link.discard()
 
     def _be_silent(self, *, waited: bool) -> None:
-        """Require silence after a failure, from the last byte of either side, so that the controller drops its frame.
+        """Require silence from the last byte of either side after a failure, so that the controller drops its frame.
 
-        The silence is brief if the controller drops incomplete frames early. It is as long as for factory settings
-        after more than ``BRIEF_SILENCES`` failures, and while an answer may still arrive. On a fast line an answer may
-        still arrive only if it was not ``waited`` for, because the controller sends its last byte within the duration
-        of an exchange.
+        The silence is brief if the controller drops incomplete frames early. After more than ``BRIEF_SILENCES``
+        failures, and while an answer may still arrive, it is as long as the factory settings require. On a fast line,
+        an answer can still arrive only if nobody ``waited`` for it, because the controller sends its last byte within
+        the duration of an exchange.
         """
         quick = self._is_quick()
         last = self._touched if quick else self._clock.now()
@@ -251,7 +251,7 @@ class Exchanger:
         self.quiet_until = last + round(self._silence * SECOND)
 
     def _is_quick(self) -> bool:
-        """Whether a byte that did not arrive in time is lost, not late as on a slow link. The retry shows which."""
+        """Whether a byte that did not arrive in time was lost rather than delayed by a slow link; the retry decides."""
         return not self._failures and len(self.durations) == RECENT and max(self.durations) <= QUICK_ANSWER * SECOND
 
     def _run_row(self, entries: Sequence[ObjectEntry], take: Callable[[int], bool]) -> Steps[None]:
@@ -263,7 +263,7 @@ class Exchanger:
                 return
 
     def _run(self, request: Frame) -> Steps[Frame]:
-        """Run one exchange; any failure within it is followed by silence."""
+        """Run one exchange; a failure is followed by silence."""
         self.began = self._clock.now()
         self._answer_awaited = False
         try:
@@ -322,7 +322,7 @@ class Exchanger:
         return stray
 
     def _receive(self, lengths: frozenset[int] | None) -> Steps[Frame | None]:
-        """Read the answer frame; None: it is damaged and the controller has dropped it: ask again."""
+        """Read the answer frame; None if the controller has dropped a damaged one, so the request must be repeated."""
         self._answer_awaited = True
         skipped = b""
         answer_timeout = 0.25
@@ -383,19 +383,19 @@ class Exchanger:
 
 
 class _BusyError(Exception):
-    """Error for an opcode that the controller refuses repeatedly; no frame is incomplete."""
+    """The controller repeatedly refused an opcode; no frame is incomplete."""
 
 
 class _HeldUpError(Exception):
     """This process was suspended during an exchange.
 
-    The controller has already dropped the exchange and accepts a new one at once.
+    The controller has already dropped the exchange and accepts a new one immediately.
     """
 
 
 @dataclass(frozen=True, slots=True)
 class ControllerIdentity:
-    """Settings of a controller; None for missing objects."""
+    """Controller identity and settings; None for missing objects."""
 
     software: int
     hardware: int | None
@@ -416,7 +416,7 @@ class ControllerIdentity:
         """Position counts per motor turn.
 
         Raises:
-            DeviceMismatchError: neither the controller nor the configuration defines them.
+            DeviceMismatchError: neither the controller nor the configuration defines the counts.
         """
         pulses = self.encoder_pulses_per_turn or config.encoder_pulses_per_turn
         if pulses is None:
@@ -424,10 +424,10 @@ class ControllerIdentity:
         return pulses * od.COUNTS_PER_PULSE
 
     def check(self, config: EposConfig) -> None:
-        """Compare with the configuration.
+        """Check the controller against the configuration.
 
         Raises:
-            DeviceMismatchError: driving would be wrong by a factor, or the motor type differs.
+            DeviceMismatchError: the speed would be wrong by a factor, or the motor type differs.
         """
         expected: tuple[tuple[ObjectEntry, int | None, int | None], ...] = (
             (od.ENCODER_PULSES, self.encoder_pulses_per_turn, config.encoder_pulses_per_turn),
@@ -448,7 +448,7 @@ async def read_identity(line: Exchanger) -> ControllerIdentity:
 
     Raises:
         WrongDeviceError: the answering device has no software version.
-        DeviceTimeoutError, ProtocolError, DeviceLostError: as ``Exchanger.read``.
+        DeviceTimeoutError, ProtocolError, DeviceLostError: the same as ``Exchanger.read``.
     """
 
     async def ask(entry: ObjectEntry) -> int | None:

@@ -73,7 +73,7 @@ def signal_name(entry: ObjectEntry) -> str:
 
 
 def power_order(word: int) -> str:
-    """Return the power order of a controlword, one of ``POWER_ORDERS``."""
+    """Return the power command in a controlword, one of ``POWER_ORDERS``."""
     if word & Control.FAULT_RESET:
         return "fault_reset"
     if not word & 0x02:
@@ -84,7 +84,7 @@ def power_order(word: int) -> str:
 
 
 def signals(now: Callable[[], int], rng: np.random.Generator) -> Signals:
-    """Return the signals of a controller."""
+    """Return a controller's signals."""
     kinds = dict.fromkeys(map(signal_name, REPORTED), SignalKind.NUMBER)
     kinds |= dict.fromkeys(map(signal_name, ORDERED), SignalKind.ORDER)
     return Signals(now, kinds | dict.fromkeys(POWER_ORDERS, SignalKind.SWITCH), rng)
@@ -117,7 +117,7 @@ class AccessRefusedError(Exception):
 
 
 class FreeMotor:
-    """Motor without load, for the emulator alone: exact ramps, slow coasting.
+    """Unloaded motor, used when the emulator runs alone: exact ramps, slow coasting.
 
     Args:
         supply_v: supply voltage.
@@ -157,12 +157,12 @@ class FreeMotor:
 
 
 class Firmware:
-    """The controller itself.
+    """The controller's firmware.
 
     Args:
-        now: time (ns).
+        now: returns the current time (ns).
         motor: shaft with its load.
-        rng: random numbers for noise and delays of the states.
+        rng: random numbers for noise and state delays.
     """
 
     def __init__(self, now: Callable[[], int], motor: MotorPlant, rng: np.random.Generator) -> None:
@@ -199,7 +199,7 @@ class Firmware:
         self.boot()
 
     def boot(self) -> None:
-        """Power-up: stored settings, switch-on disabled, target 0, position 0, empty error history."""
+        """Power up with stored settings, "switch-on disabled", target 0, position 0 and an empty error history."""
         self.state = State.SWITCH_ON_DISABLED
         self._values = dict(self._stored)
         self._history: list[int] = []
@@ -222,16 +222,16 @@ class Firmware:
 
     @property
     def frame_timeout(self) -> float:
-        """Silence after which an incomplete frame is dropped (s)."""
+        """Silence after which the controller drops an incomplete frame (s)."""
         return self._values[od.RS232_TIMEOUT] / 1000
 
     # Objects
 
     def read(self, index: int, sub: int) -> int:
-        """Read an object, 32 bits.
+        """Read an object of up to 32 bits.
 
         Raises:
-            AccessRefusedError: no such object, or not readable.
+            AccessRefusedError: the object does not exist or is not readable.
         """
         entry = self._find(index, sub)
         if entry.access == "wo" or entry.width > 32:
@@ -246,7 +246,7 @@ class Firmware:
         """Bytes of an object for a segmented read.
 
         Raises:
-            AccessRefusedError: no such object.
+            AccessRefusedError: the object does not exist.
         """
         entry = self._find(index, sub)
         return SERIAL if entry is od.SERIAL_NUMBER else self.read(index, sub).to_bytes(4, "little")[: entry.width // 8]
@@ -255,7 +255,8 @@ class Firmware:
         """Write an object.
 
         Raises:
-            AccessRefusedError: no such object, read-only, out of range, or wrong state.
+            AccessRefusedError: the object does not exist or is read-only, the value is out of range, or the state is
+                wrong.
         """
         entry = self._find(index, sub)
         if entry.access == "ro":
@@ -275,7 +276,7 @@ class Firmware:
             self._apply(entry, value)
 
     def _obey(self, word: int) -> None:
-        """Execute a controlword; without supply none is executed."""
+        """Execute a controlword; nothing is executed without supply voltage."""
         if self.state is not State.NOT_READY:
             self._control(word)
 
@@ -297,7 +298,7 @@ class Firmware:
         return (counts + 2**31) % 2**32 - 2**31
 
     def _velocity(self, reading: MotorReading) -> int:
-        """Velocity (rpm) from the counts within 1 ms, which is coarse."""
+        """Velocity (rpm) from the counts within 1 ms, hence coarse."""
         per_ms = self._values[od.ENCODER_PULSES] * od.COUNTS_PER_PULSE / 60_000
         return round(round(reading.rpm * per_ms + self._rng.uniform(-0.5, 0.5)) / per_ms)
 
@@ -354,7 +355,7 @@ class Firmware:
                 self._command_motor()
 
     def _transition(self, word: int) -> State | None:
-        """State requested by a controlword; None: impossible from the current state."""
+        """State requested by a controlword; None if it cannot be reached from the current state."""
         if not word & 0x02:
             return State.SWITCH_ON_DISABLED
         if not word & 0x04:
@@ -370,7 +371,7 @@ class Firmware:
         return State.ENABLED if self.state in (State.SWITCHED_ON, *POWERED) else None
 
     def set_quick_stop_input(self, active: bool) -> None:
-        """Set the hardware line: while active the motor is stopped and cannot be enabled."""
+        """Set the quick-stop input: while it is active, the motor is stopped and cannot be enabled."""
         self.advance()
         self.quick_stop_input = active
         if active and self.state is State.ENABLED:
@@ -381,7 +382,7 @@ class Firmware:
             self._command_motor()
 
     def fail(self, code: int) -> None:
-        """Handle a fault: history, reaction, power stage off."""
+        """Handle a fault: add it to the history, react, and switch the power stage off."""
         self._history = [code, *self._history][: od.HISTORY_SIZE]
         running = self.state in POWERED
         self._set(State.FAULT_REACTION_ENABLED if running else State.FAULT_REACTION_DISABLED)
@@ -391,7 +392,7 @@ class Firmware:
     def advance(self) -> MotorReading:
         """Update everything that depends on time: filters, supply faults, transient states.
 
-        Return the motor's state.
+        Returns the motor's state.
         """
         now, state = self._now(), self.state
         reading = self._motor.reading(now)
@@ -422,7 +423,7 @@ class Firmware:
             self._command_motor()
 
     def run_away(self, runaway: DisobedientMotor | None) -> None:
-        """Deviate from the commands from now on; None: obey again."""
+        """Start to deviate from the commands; None to obey again."""
         self.advance()
         self.runaway = runaway
         self._command_motor()
@@ -444,7 +445,7 @@ class Firmware:
         self._motor.command(now, target, float(ramp))
 
     def _demand(self, rpm: float) -> tuple[float | None, int]:
-        """Commanded speed (None: power stage off), and its ramp, rpm/s."""
+        """Commanded speed (None if the power stage is off) and its ramp (rpm/s)."""
         match self.state:
             case State.ENABLED:
                 target = self._target()

@@ -12,10 +12,10 @@ from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, Wrong
 
 
 async def identify(link: Link, clock: Clock, settings: EposConfig) -> dict[str, Any]:
-    """Handshake, identity, state, fault history and first samples; only reads.
+    """Read the identity, state, fault history and first samples; nothing is written.
 
     Args:
-        link: open line to the controller.
+        link: open link to the controller.
         clock: time.
         settings: driver settings with the node id.
 
@@ -64,7 +64,7 @@ async def _report(line: Exchanger, clock: Clock) -> dict[str, Any]:
 
 
 async def _serial_number(line: Exchanger) -> str | None:
-    """Serial number (hexadecimal); None if the firmware's segmented read differs from its documentation."""
+    """Serial number (hexadecimal); None if segmented reads do not work as documented."""
     try:
         return (await line.read_long(od.SERIAL_NUMBER)).hex()
     except (DeviceTimeoutError, ProtocolError):

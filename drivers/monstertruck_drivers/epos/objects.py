@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObjectEntry:
-    """One object: address, width in bits, sign and access (``ro``, ``wo``, ``rw``)."""
+    """One object: address, width in bits, signedness and access (``ro``, ``wo``, ``rw``)."""
 
     name: str
     index: int
@@ -23,10 +23,10 @@ class ObjectEntry:
         return (-(1 << (self.width - 1)), (1 << (self.width - 1)) - 1) if self.signed else (0, (1 << self.width) - 1)
 
     def encode(self, value: int) -> int:
-        """``value`` as unsigned 32 bits, sign- or zero-extended.
+        """Encode ``value`` as unsigned 32 bits, sign- or zero-extended.
 
         Raises:
-            ValueError: it does not fit.
+            ValueError: ``value`` does not fit.
         """
         low, high = self.limits
         if not low <= value <= high:
@@ -34,7 +34,7 @@ class ObjectEntry:
         return value & 0xFFFFFFFF
 
     def decode(self, raw: int) -> int:
-        """Decode the value from 32 bits, truncated to the object's size."""
+        """Decode a value from 32 bits, truncated to the object's size."""
         value = raw & ((1 << self.width) - 1)
         return value - (1 << self.width) if self.signed and value >> (self.width - 1) else value
 

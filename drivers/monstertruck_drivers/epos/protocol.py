@@ -1,4 +1,4 @@
-"""Frames and power states of the first-generation EPOS on RS232 (maxon Communication Guide; DS402).
+"""Frames and power states of the first-generation EPOS over RS232 (maxon Communication Guide; DS402).
 
 One exchange, strictly one at a time (``>`` host, ``<`` controller)::
 
@@ -50,7 +50,7 @@ class Opcode(IntEnum):
 
 
 class NmtCommand(IntEnum):
-    """Network management; the controller sends no answer frame to these."""
+    """Network management commands, which the controller does not answer."""
 
     START = 1
     STOP = 2
@@ -67,7 +67,7 @@ class Frame(NamedTuple):
 
     @property
     def head(self) -> bytes:
-        """Byte that requests permission to send ``body``."""
+        """Opcode byte, which requests permission to send ``body``."""
         return bytes((self.opcode,))
 
     @property
@@ -83,7 +83,7 @@ def crc(words: Sequence[int]) -> int:
 
 
 def checksum(opcode: int, words: Sequence[int]) -> int:
-    """CRC of a frame: its first word is opcode and length-1."""
+    """CRC of a frame, whose first word holds the opcode and length-1."""
     return crc(((opcode << 8) | (len(words) - 1), *words))
 
 
@@ -96,7 +96,7 @@ def decode_body(opcode: int, body: bytes) -> Frame:
     """Parse a frame from ``body`` (length byte first).
 
     Raises:
-        FrameError: size or CRC is wrong.
+        FrameError: the size or the CRC is wrong.
     """
     if not body or len(body) != 1 + body_size(body[0]):
         raise FrameError(f"frame of {len(body)} bytes does not match its length byte")
@@ -140,17 +140,17 @@ class ObjectSegment:
 
     @property
     def words(self) -> tuple[int, ...]:
-        """Data words after the error code: control byte, then the bytes, padded to whole words."""
+        """Data words after the error code: control byte, then the data bytes, padded to complete words."""
         raw = bytes((len(self.data) | (0x40 * self.toggle) | (0x80 * self.more),)) + self.data
         raw += bytes(len(raw) % 2)
         return struct.unpack(f"<{len(raw) // 2}H", raw)
 
 
 def decode_segment(words: Sequence[int]) -> ObjectSegment:
-    """Segment from the words after the error code.
+    """Decode a segment from the words after the error code.
 
     Raises:
-        FrameError: fewer bytes than announced.
+        FrameError: there are fewer bytes than announced.
     """
     raw = struct.pack(f"<{len(words)}H", *words)
     if not raw or len(raw) < 1 + (raw[0] & 0x3F):
@@ -159,7 +159,7 @@ def decode_segment(words: Sequence[int]) -> ObjectSegment:
 
 
 def answer(error: int = 0, *data: int) -> Frame:
-    """Answer frame: 32-bit error code, then data words."""
+    """Return an answer frame: 32-bit error code, then data words."""
     return Frame(ANSWER, (*split(error), *data))
 
 
@@ -167,7 +167,7 @@ def error_of(frame: Frame) -> int:
     """Error code of an answer; 0 = ok.
 
     Raises:
-        FrameError: too short for an error code.
+        FrameError: the frame is too short for an error code.
     """
     if len(frame.words) < 2:
         raise FrameError("answer without an error code")
@@ -175,7 +175,7 @@ def error_of(frame: Frame) -> int:
 
 
 def split(value: int) -> tuple[int, int]:
-    """Split 32 bits into words, low word first."""
+    """Split a 32-bit value into words, low word first."""
     return value & 0xFFFF, value >> 16
 
 
@@ -185,7 +185,7 @@ def join(low: int, high: int) -> int:
 
 
 class Control(IntEnum):
-    """Whole controlwords."""
+    """Complete controlwords."""
 
     DISABLE_VOLTAGE = 0x0000
     QUICK_STOP = 0x0002
@@ -224,7 +224,7 @@ _STATES = {state.value: state for state in State}
 
 
 def state_of(statusword: int) -> State:
-    """Power state of a statusword."""
+    """Power state in a statusword."""
     return _STATES.get(statusword & STATE_MASK, State.UNKNOWN)
 
 
@@ -242,7 +242,7 @@ _STEPS: dict[State, dict[State, Control]] = {
 
 
 def next_control(state: State, goal: State) -> Control | None:
-    """Controlword that brings ``state`` one step closer to ``goal``; None: wait, or already there.
+    """Controlword that brings ``state`` one step closer to ``goal``; None to wait, or if the goal is already reached.
 
     Args:
         state: current state.
@@ -252,7 +252,7 @@ def next_control(state: State, goal: State) -> Control | None:
 
 
 def stop_frames(node: int) -> tuple[Frame, Frame]:
-    """Quick stop, then power stage off: the two writes that make any state safe."""
+    """Quick stop, then power stage off: these two writes make any state safe."""
     return (
         write_request(CONTROLWORD, Control.QUICK_STOP, node),
         write_request(CONTROLWORD, Control.DISABLE_VOLTAGE, node),

@@ -1,4 +1,4 @@
-"""Settings of Hokuyo scanners."""
+"""Settings for Hokuyo scanners."""
 
 from typing import Annotated, ClassVar, Literal
 
@@ -10,7 +10,7 @@ from monstertruck_drivers.scanning.config import ReturnsConfig, ScannerConfig
 
 
 class ScipConfig(ScannerConfig):
-    """Driver settings of a SCIP scanner; the driver always reads the scan geometry from the sensor."""
+    """Settings for a SCIP scanner; the driver always reads the scan geometry from the sensor."""
 
     SERIES: ClassVar[tuple[str, ...]]
     """Supported series: the product or model name must contain one of these names."""

@@ -1,4 +1,4 @@
-"""Driver of Hokuyo scanners and its SCIP session.
+"""Driver for Hokuyo scanners, and its SCIP session.
 
 A session wakes the scanner from any state, identifies it, compares clocks and silences it; the driver streams scans in
 a session until it is cancelled or lost.
@@ -93,7 +93,7 @@ class ScipSession:
         """Receive the next reply, whichever request it answers.
 
         Raises:
-            DeviceTimeoutError: no complete reply within ``seconds``.
+            DeviceTimeoutError: no complete reply arrived within ``seconds``.
             DeviceLostError: the link went down.
         """
         end = self._clock.now() + round(seconds * SECOND)
@@ -105,10 +105,10 @@ class ScipSession:
         return self._replies.popleft()
 
     async def ask(self, command: str) -> Reply:
-        """Send a command and wait for its reply, skipping everything else; a busy sensor is asked twice.
+        """Send a command and wait for its reply, skipping all others; repeat it once if the sensor is busy.
 
         Raises:
-            DeviceTimeoutError: no answer.
+            DeviceTimeoutError: the sensor does not answer.
             DeviceLostError: the link went down.
         """
         reply = await self._ask_once(command)
@@ -123,7 +123,7 @@ class ScipSession:
 
         Raises:
             DeviceFaultError: the sensor reports a fault.
-            ProtocolError: it refuses the command.
+            ProtocolError: the sensor refuses the command.
         """
         reply = await self.ask(command)
         outcome = classify(command, reply.status)
@@ -137,8 +137,8 @@ class ScipSession:
         """Bring the sensor to rest from any state and identify it.
 
         Raises:
-            WrongDeviceError: another device, or another unit than configured.
-            DeviceTimeoutError: silence.
+            WrongDeviceError: another device answers, or another unit than the configured one.
+            DeviceTimeoutError: the sensor does not answer.
             ProtocolError: the sensor violates its protocol.
         """
         self._dialect = await self._wake()
@@ -155,13 +155,13 @@ class ScipSession:
         return sensor
 
     async def compare_clocks(self) -> Anchor | None:
-        """Read the sensor's counter in time-adjust mode; the fastest of several exchanges is used.
+        """Read the sensor's counter in time-adjust mode; uses the fastest of several exchanges.
 
         Returns:
-            None if the sensor refuses that mode.
+            Clock anchor; None if the sensor refuses time-adjust mode.
 
         Raises:
-            ProtocolError: the time is damaged, or the mode is not left.
+            ProtocolError: the time is damaged, or the sensor does not leave time-adjust mode.
         """
         if classify("TM0", (await self.ask("TM0")).status) not in (StatusMeaning.OK, StatusMeaning.ALREADY):
             return None
@@ -197,7 +197,7 @@ class ScipSession:
         self._replies += self.parser.feed(data)
 
     async def _exchange(self, command: str, silence: float | None = None) -> Reply:
-        """Send and wait for the echo; raises TimeoutError after ``silence`` seconds without a byte."""
+        """Send a command and wait for its echo; raises TimeoutError after ``silence`` seconds without a byte."""
         self._replies.clear()
         self._link.write(request(command))
         while True:
@@ -216,7 +216,7 @@ class ScipSession:
             raise DeviceTimeoutError(f"{self._link.name}: no answer to {command}") from error
 
     async def _wake(self) -> Dialect:
-        """End any activity of the sensor; it is idle afterwards."""
+        """End any activity of the sensor, so that it is idle."""
         await self._discard(0.05)  # seconds after opening whose bytes are discarded
         for _ in range(4):  # one QT completes an incomplete line, three may remain unanswered
             try:
@@ -247,10 +247,10 @@ class ScipSession:
         self._replies.clear()
 
     async def _drain(self) -> None:
-        """Discard everything until the line is silent.
+        """Discard all input until the line is silent.
 
         Raises:
-            ProtocolError: the line is never silent.
+            ProtocolError: the line does not become silent.
         """
         try:
             async with self._clock.deadline(2.0):
@@ -264,7 +264,7 @@ class ScipSession:
         self._replies.clear()
 
     async def _fields(self, command: str, last: str) -> dict[str, str]:
-        """Text fields of an answer that ends with the field ``last``, even if an empty line splits it."""
+        """Request a reply's text fields up to the field ``last``, even if an empty line splits the reply."""
         lines = list((await self.demand(command)).lines)
         with contextlib.suppress(DeviceTimeoutError):
             while not any(line.startswith(last.encode() + b":") for line in lines):
@@ -286,7 +286,7 @@ class ScipSession:
 
 
 class HokuyoDriver(ScannerDriver[ScipConfig]):
-    """Scanner that uses SCIP."""
+    """Driver for a scanner that uses SCIP."""
 
     scans = 0
     """Number of scans published since the daemon started."""
@@ -294,14 +294,15 @@ class HokuyoDriver(ScannerDriver[ScipConfig]):
     """Number of damaged scans since the daemon started."""
 
     async def run(self, ready: Ready) -> None:
-        """One session: wake, identify, compare clocks, stream; the laser is off when it ends.
+        """Run one session: wake, identify, compare clocks, stream. The laser is off when the session ends.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: silence, no valid scan for ``stale_periods``, or scans with a growing delay.
+            DeviceLostError: the scanner was unplugged.
+            DeviceTimeoutError: the scanner is silent, sent no valid scan for ``stale_periods``, or its scans arrive
+                with a growing delay.
             WrongDeviceError: another device answers.
-            ProtocolError: too many damaged scans in a row, or a violation of the protocol.
-            DeviceFaultError: the sensor reports a hardware fault; it was reset once.
+            ProtocolError: too many consecutive scans are damaged, or the scanner violates the protocol.
+            DeviceFaultError: the sensor reports a hardware fault that one reset did not clear.
         """
         async with await self._port.open() as link:
             session = ScipSession(link, self._clock, self._config)
@@ -369,7 +370,7 @@ class HokuyoDriver(ScannerDriver[ScipConfig]):
     # SCIP 1.1
 
     async def _poll(self, session: ScipSession, sensor: Sensor, ready: Ready) -> None:
-        """Units with SCIP 1.1 only: request every scan; they send no time, so the time of arrival is used."""
+        """Request every scan from a unit that supports SCIP 1.1 only; it sends no time, so the arrival time is used."""
         config, geometry = self._config, sensor.parameters
         shape = (geometry.first_step, geometry.last_step, config.cluster)
         await session.demand("L1")
@@ -403,7 +404,7 @@ class HokuyoDriver(ScannerDriver[ScipConfig]):
             raise DeviceTimeoutError(f"{self._port.name}: no valid scan in time") from error
 
     def _decode(self, reply: Reply, shape: tuple[int, int, int], bad: int) -> ScanBlock | None:
-        """Parse a scan; None if it is damaged. The first damaged scan in a row (``bad`` 0) is reported."""
+        """Parse a scan; None if it is damaged. The first of consecutive damaged scans (``bad`` 0) is reported."""
         try:
             return decode_scan(reply, *shape)
         except ProtocolError as error:
@@ -460,7 +461,7 @@ class HokuyoDriver(ScannerDriver[ScipConfig]):
 def split(
     values: NDArray[np.int32], geometry: Parameters, config: ScipConfig
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Split scan values into ranges and error codes, by the error values of the scanner's series."""
+    """Split scan values into ranges and error codes, using the error values of the scanner's series."""
     if isinstance(config, HokuyoLxConfig):
         free = config.no_return == "free"
         return split_lx_ranges(values, geometry.least_mm, geometry.greatest_mm, free=free)

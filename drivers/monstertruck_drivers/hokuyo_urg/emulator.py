@@ -1,8 +1,8 @@
-"""Device side of a URG-04LX, byte for byte: power-up state, both dialects, streaming, time, faults.
+"""Emulated URG-04LX, byte for byte: power-up state, both dialects, streaming, time and faults.
 
 Three tasks run forever: one reads request lines, one answers them after a delay, and one is the rotor, which turns
-every 100 ms of the sensor's clock with or without a client. A requested stream ends with QT, RS, its count or a loss of
-supply; it continues if the host dies.
+every 100 ms of the sensor's clock with or without a client. A requested stream ends with QT, with RS, after its count
+or at power loss; it continues if the host dies.
 
 Where the specification is silent the emulator answers TM0 during a scan with 0A, MD during a stream with 0B,
 and everything but TM and RS in time-adjust mode with 0E.
@@ -60,7 +60,7 @@ class ScanOrder:
 
 
 def parse_order(text: str, tag: str = "", greatest: int = URG_04LX.greatest_step) -> ScanOrder | str:
-    """Parse a request for scans (MD, GS ...) of steps up to ``greatest``; a rejection is its two-character status."""
+    """Parse a scan request (MD, GS ...) for steps up to ``greatest``; return its two-character status if rejected."""
     command, digits = text[:2], text[2:]
     multi = command[0] == "M"
     wanted = 13 if multi else 10
@@ -79,7 +79,7 @@ def parse_order(text: str, tag: str = "", greatest: int = URG_04LX.greatest_step
 
 
 def parse_scip1_order(text: str) -> ScanOrder | None:
-    """Parse G of SCIP 1.1; None if it is rejected."""
+    """Parse the SCIP 1.1 request G; None if it is rejected."""
     digits = text[1:]
     if text[:1] != "G" or len(digits) != 8 or not digits.isdigit():
         return None
@@ -88,12 +88,12 @@ def parse_scip1_order(text: str) -> ScanOrder | None:
 
 
 def scan_lines(order: ScanOrder, counter: int, revolution: NDArray[np.int32]) -> list[bytes]:
-    """Lines of a scan after its status: time line (not in SCIP 1.1) and data.
+    """Lines of a scan after its status: the time line (not in SCIP 1.1) and the data lines.
 
     Args:
         order: requested scan.
         counter: time at step 0 (ms, 24 bits).
-        revolution: values of all steps, mm or error codes.
+        revolution: values of all steps (mm or error codes).
     """
     values = _clustered(revolution[order.start : order.end + 1], order.cluster)
     if order.command.endswith("E"):
@@ -106,7 +106,7 @@ def scan_lines(order: ScanOrder, counter: int, revolution: NDArray[np.int32]) ->
 
 
 def _strength(values: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return intensities for ranges (mm); they fall with the distance."""
+    """Return intensities for ranges (mm); they decrease with distance."""
     bright = 4000  # intensity of a near white surface; it decreases with the distance
     fading = 6000  # distance that halves the intensity, mm
     return np.rint(bright / (1.0 + (np.maximum(values, 0) / fading) ** 2)).astype(np.int32)
@@ -150,26 +150,26 @@ class HokuyoEmulator(FaultyDevice):
     Faults (``inject``): ``status N`` sends that status with the next revolution of a stream: 21-49 hold the stream
     until 98, 50-97 end it. ``deaf`` ignores requests; ``fragile``: an unknown command makes the sensor deaf. ``cut``
     ends the next scan in the middle of a line. ``laser`` keeps the laser off. ``seri`` puts a wrong checksum on SERI
-    and an empty line into VV. ``tm`` makes the sensor refuse its time-adjust mode. ``timer`` sets the counter,
+    and an empty line into VV. ``tm`` makes the sensor refuse its time-adjust mode. ``timer`` sets the counter, and
     ``drift`` the rate error of the sensor's clock. ``cover`` covers the window between two directions (degrees from
     straight ahead, left positive): the beams, or a random share of them, return the value (below 20: an error code,
-    otherwise mm). ``mirror`` puts a mirror there: its middle dazzles, the rest shows the room behind the mirror, twice
-    as far away.
+    otherwise mm). ``mirror`` puts a mirror there: its middle dazzles the sensor; the rest shows the room behind the
+    mirror, at twice the distance.
 
     Args:
         clock: world time.
-        source: source of the ranges, read at the end of each revolution that is sent.
-        seed: seed of the USB jitter.
+        source: range source, read at the end of each revolution that is sent.
+        seed: seed for the USB jitter.
         model: scanner model.
         state: initial state: freshly powered (SCIP 1.1), configured to start in SCIP 2.0, left streaming or
             in time-adjust mode by a dead host.
         serial: ``SERI`` of VV.
         firmware: ``FIRM`` of VV; a major version below 3 supports SCIP 1.1 only.
         timer_start: counter at construction (ms).
-        drift_ppm: rate error of the sensor's clock; positive runs faster than the world.
-        jitter: maximum delay of a scan by USB batching (s).
-        min_step: first measuring step (``AMIN``); default: value of the model.
-        max_step: last measuring step (``AMAX``); default: value of the model.
+        drift_ppm: rate error of the sensor's clock; positive if it runs fast.
+        jitter: maximum delay of a scan caused by USB batching (s).
+        min_step: first measuring step (``AMIN``); default: the model's value.
+        max_step: last measuring step (``AMAX``); default: the model's value.
     """
 
     def __init__(
@@ -246,7 +246,7 @@ class HokuyoEmulator(FaultyDevice):
             tasks.create_task(self._turn(end), name=f"{self.name} turns")
 
     def power_cycle(self) -> None:
-        """Switch off and on: SCIP 1.1 unless configured to start in 2.0, counter at zero, accepting requests again."""
+        """Switch the supply off and on: SCIP 1.1 unless configured to start in 2.0, counter at zero, no longer deaf."""
         self._power_up()
         self._scip2 = self._state == "scip2"
 
@@ -290,7 +290,7 @@ class HokuyoEmulator(FaultyDevice):
         self._covers.append((self._steps_between(begin, end), mirror))
 
     def _steps_between(self, begin: str, end: str) -> slice:
-        """Steps between two directions, degrees from straight ahead, left positive."""
+        """Steps between two directions (degrees from straight ahead, left positive)."""
         model = self._model
         first, last = (
             model.front_step + round(float(degrees) * model.steps_per_turn / 360) for degrees in (begin, end)
@@ -342,7 +342,7 @@ class HokuyoEmulator(FaultyDevice):
                 self._send_scan(end, order, begin)
 
     async def _next_revolution(self, previous: int | None) -> int | None:
-        """Sensor time at step 0 of the revolution after ``previous``; None if the rotor has stopped for good."""
+        """Sensor time at step 0 of the revolution after ``previous``; None if the rotor has stopped permanently."""
         period = self._model.period
         if previous is None:
             return -(-self._time() // period) * period
@@ -356,7 +356,7 @@ class HokuyoEmulator(FaultyDevice):
         return (self._time() - self._sweep()) // period * period
 
     def _measure(self, begin: int) -> NDArray[np.int32]:
-        """Values of all steps, mm or codes."""
+        """Measure the values of all steps (mm or error codes)."""
         revolution = self._source.scan(self._world_time(begin))
         if self._covers:
             revolution = revolution.copy()
@@ -369,7 +369,7 @@ class HokuyoEmulator(FaultyDevice):
         return self._steps[1] * self._model.period // self._model.steps_per_turn + processing
 
     def _sent_at(self, begin: int) -> int:
-        """World time at which the scan started at ``begin`` reaches the host."""
+        """World time at which the host receives the scan that started at ``begin``."""
         late = self._rng.uniform(0.0, self._jitter) if self._jitter > 0 else 0.0
         return self._world_time(begin + self._sweep()) + round(late * SECOND)
 
@@ -457,7 +457,7 @@ class HokuyoEmulator(FaultyDevice):
         return reply.replace(b"\nFIRM", b"\n\nFIRM") if text == "VV" and self.faults["seri"] else reply
 
     def _handlers(self) -> dict[str, Handler]:
-        """Handlers of requests, by the first two characters."""
+        """Request handlers by the first two characters of the request."""
         return {
             "VV": self._vv,
             "PP": self._pp,
@@ -532,7 +532,7 @@ class HokuyoEmulator(FaultyDevice):
         return self._qt(text, tag)
 
     def _cr(self, text: str, _tag: str) -> tuple[str, list[bytes]]:
-        """Answer CR; the rotor has only its default speed."""
+        """Answer CR; the rotor supports only its default speed."""
         return ("03" if text == "CR00" else "04"), []
 
     def _tm(self, text: str, _tag: str) -> tuple[str, list[bytes]]:
@@ -587,5 +587,5 @@ class HokuyoEmulator(FaultyDevice):
 
 
 def emulated(setup: EmulatorSetup) -> HokuyoEmulator:
-    """Create the lidar of a simulated truck."""
+    """Create a simulated truck's lidar."""
     return HokuyoEmulator(setup.clock, setup.room, seed=setup.seed)

@@ -21,10 +21,10 @@ async def identify(link: Link, clock: Clock, settings: ScipConfig) -> dict[str, 
     """Perform the handshake and take one scan; the laser is off afterwards.
 
     Returns:
-        JSON-able: ``dialect``, ``identity``, ``parameters``, ``state`` and a summary of the ``scan``.
+        JSON-compatible dict: ``dialect``, ``identity``, ``parameters``, ``state`` and a summary of the ``scan``.
 
     Raises:
-        DeviceError: see the driver's ``run``.
+        DeviceError: the same errors as from the driver's ``run``.
     """
     session = ScipSession(link, clock, settings)
     sensor = await session.handshake()

@@ -1,6 +1,6 @@
-"""Device side of a UST or UTM: SCIP 2.2 on a network socket.
+"""Emulated UST or UTM: SCIP 2.2 over a network socket.
 
-Unlike the URG-04LX it has neither SCIP 1.1 nor a baud rate. It adds scans with intensities, a state (``%ST``), a
+Unlike the URG-04LX, it has neither SCIP 1.1 nor a baud rate. It adds scans with intensities, a state (``%ST``), a
 partial reset (``RT``) and a reboot (``RB``). The specification leaves open whether a stream ends with its connection;
 here it continues.
 """
@@ -20,10 +20,10 @@ from monstertruck_runtime.clock import Clock
 
 
 class BeamRanges:
-    """``RangeSource`` of a scanner of any geometry.
+    """``RangeSource`` for a scanner of any geometry.
 
     Args:
-        source: ranges of single beams.
+        source: source of single-beam ranges.
         model: geometry and error values.
     """
 
@@ -46,13 +46,13 @@ class BeamRanges:
 class LxEmulator(HokuyoEmulator):
     """Emulated UST or UTM.
 
-    Faults (``inject``): ``unstable N`` (0M in place of the next N scans), and the faults of the URG-04LX.
+    Faults (``inject``): ``unstable N`` (status 0M instead of the next N scans), and the faults of the URG-04LX.
 
     Args:
-        clock: the world's time.
-        source: source of the ranges.
+        clock: world time.
+        source: range source.
         model: scanner model.
-        seed: seed of the jitter.
+        seed: jitter seed.
         options: see ``HokuyoEmulator``.
     """
 
@@ -100,7 +100,7 @@ class LxEmulator(HokuyoEmulator):
         return self._rs(text, tag)
 
     def _reboot(self, _text: str, _tag: str) -> tuple[str, list[bytes]]:
-        """Reboot at the second of two consecutive requests."""
+        """Reboot on the second of two consecutive requests."""
         if not self._rebooting:
             self._rebooting = True
             return "01", []
@@ -110,6 +110,6 @@ class LxEmulator(HokuyoEmulator):
 
 
 def emulated(setup: EmulatorSetup) -> LxEmulator:
-    """Create the lidar of a simulated robot."""
+    """Create a simulated robot's lidar."""
     settings = setup.settings if isinstance(setup.settings, HokuyoLxConfig) else HokuyoLxConfig()
     return LxEmulator(setup.clock, setup.room, LX[settings.model], seed=setup.seed)

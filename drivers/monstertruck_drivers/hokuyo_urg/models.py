@@ -1,4 +1,4 @@
-"""Data sheets of the scanners, for their answers to PP and their emulators."""
+"""Scanner data sheets, used for replies to PP and by the emulators."""
 
 from typing import Final, NamedTuple
 
@@ -7,7 +7,7 @@ from monstertruck_drivers.hokuyo_urg.protocol import UNRETURNED
 
 
 class ScannerModel(NamedTuple):
-    """Data sheet of a model."""
+    """Data sheet of one scanner model."""
 
     product: str
     """``PROD`` of VV."""
@@ -37,7 +37,7 @@ class ScannerModel(NamedTuple):
 
     @property
     def period(self) -> int:
-        """Revolution period of the sensor's clock (ns)."""
+        """Revolution period on the sensor's clock (ns)."""
         return 60_000_000_000 // self.rpm
 
 

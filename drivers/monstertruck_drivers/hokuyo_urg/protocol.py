@@ -1,4 +1,4 @@
-"""SCIP 1.1 and 2.0 as pure functions: sums, 6-bit encoding, requests, replies, text fields, ranges. No I/O.
+"""SCIP 1.1 and 2.0 as pure functions: checksums, 6-bit encoding, requests, replies, text fields, ranges. No I/O.
 
 A reply is an echo line, a status line, any number of lines and an empty line; in SCIP 2.0 every line
 after the echo ends with a checksum character. Source: SCIP 2.0 specification, checked against a capture of
@@ -40,12 +40,12 @@ MAX_REPLY: Final = 8192
 
 
 def line_sum(text: bytes) -> int:
-    """Checksum character of a line, from its bytes without checksum and LF."""
+    """Checksum character for the bytes of a line (without checksum and LF)."""
     return (sum(text) & 0x3F) + 0x30
 
 
 def sum_matches(line: bytes) -> bool:
-    """Whether ``line`` (with its checksum character) is intact; the checksum may include a ``;`` before it or not."""
+    """Whether ``line`` with its checksum character is intact; the checksum may or may not cover a preceding ``;``."""
     text, check = line[:-1], line[-1:]
     if not check:
         return False
@@ -56,7 +56,7 @@ def encode(value: int, width: int) -> bytes:
     """Encode ``value`` as ``width`` characters of six bits each, most significant first.
 
     Raises:
-        ValueError: it does not fit.
+        ValueError: ``value`` does not fit.
     """
     if not 0 <= value < 1 << 6 * width:
         raise ValueError(f"{value} does not fit into {width} characters")
@@ -67,7 +67,7 @@ def decode(text: bytes) -> int:
     """Inverse of :func:`encode`.
 
     Raises:
-        ProtocolError: a character outside ``0`` to ``o``.
+        ProtocolError: a character is outside ``0`` to ``o``.
     """
     value = 0
     for byte in text:
@@ -78,7 +78,7 @@ def decode(text: bytes) -> int:
 
 
 def encode_array(values: NDArray[np.integer], width: int) -> bytes:
-    """Encode an array of shape (n,) as ``n * width`` characters; bits that do not fit are cut off."""
+    """Encode an array of shape (n,) as ``n * width`` characters; excess bits are dropped."""
     shifts = np.arange(6 * (width - 1), -1, -6)
     return ((values[:, None] >> shifts & 0x3F) + 0x30).astype(np.uint8).tobytes()
 
@@ -87,7 +87,7 @@ def decode_array(payload: bytes, width: int) -> NDArray[np.int32]:
     """Inverse of :func:`encode_array`.
 
     Raises:
-        ProtocolError: a character outside ``0`` to ``o``, or a truncated number.
+        ProtocolError: a character is outside ``0`` to ``o``, or a number is truncated.
     """
     if len(payload) % width:
         raise ProtocolError(f"SCIP: {len(payload)} characters are not a whole number of {width}-character ranges")
@@ -111,7 +111,7 @@ def unwrap_lines(lines: list[bytes], *, sums: bool = True) -> bytes:
     """Join data lines and verify their checksums.
 
     Raises:
-        ProtocolError: a line with a wrong sum or more than 64 payload characters.
+        ProtocolError: a line has a wrong checksum or more than 64 payload characters.
     """
     if not sums:
         return b"".join(lines)
@@ -131,7 +131,7 @@ def request(command: str, tag: str = "") -> bytes:
     """Encode a command, with an optional tag that the sensor echoes.
 
     Raises:
-        ValueError: characters the sensor would refuse, or too long a tag.
+        ValueError: the sensor would refuse a character, or the tag is too long.
     """
     if len(tag) > TAG_LIMIT:
         raise ValueError(f"tag {tag!r} is longer than {TAG_LIMIT} characters")
@@ -142,20 +142,20 @@ def request(command: str, tag: str = "") -> bytes:
 
 
 def scan_command(scan_format: ScanFormat, start: int, end: int, cluster: int = 1, skip: int = 0, count: int = 0) -> str:
-    """``MD`` or ``MS`` for steps ``start`` to ``end``; ``skip`` revolutions between two scans; count 0 = endless.
+    """Return ``MD`` or ``MS`` for steps ``start`` to ``end``; skip ``skip`` turns between scans (count 0: no end).
 
     Raises:
-        ValueError: a parameter outside its digits.
+        ValueError: a parameter has too many digits.
     """
     _digits(start=(start, 9999), end=(end, 9999), cluster=(cluster, 99), skip=(skip, 9), count=(count, 99))
     return f"{scan_format}{start:04d}{end:04d}{cluster:02d}{skip:d}{count:02d}"
 
 
 def scip1_scan_command(start: int, end: int, cluster: int = 1) -> str:
-    """``G`` (SCIP 1.1), which requests the latest revolution once.
+    """Return ``G`` (SCIP 1.1), which requests the latest revolution once.
 
     Raises:
-        ValueError: a parameter outside its digits.
+        ValueError: a parameter has too many digits.
     """
     _digits(start=(start, 999), end=(end, 999), cluster=(cluster, 99))
     return f"G{start:03d}{end:03d}{cluster:02d}"
@@ -183,16 +183,16 @@ class Reply:
 
     @property
     def scip1(self) -> bool:
-        """True if a sensor in SCIP 1.1 answered."""
+        """Whether the answering sensor uses SCIP 1.1."""
         return len(self.status) == 1
 
     def answers_scan(self, command: str) -> bool:
-        """Whether this belongs to the stream that ``command`` (MD/MS) started, whatever count remains."""
+        """Whether this reply belongs to the stream started by ``command`` (MD/MS), whatever count remains."""
         return len(self.echo) == len(command) and self.echo[:13] == command[:13] and self.echo[13:].isdigit()
 
 
 def build_reply(echo: str, status: str, lines: list[bytes] | None = None) -> bytes:
-    """Encode a reply; ``lines`` carry their own checksum characters."""
+    """Encode a reply; ``lines`` already contain their checksum characters."""
     head = status.encode("ascii")
     if len(status) > 1:
         head += bytes((line_sum(head),))
@@ -207,7 +207,7 @@ _TEXT_LINE = re.compile(rb"[A-Z]{4}:")
 
 
 class ScipParser:
-    """Incremental parser of replies; it resynchronises after lost, flipped or foreign bytes."""
+    """Incremental reply parser; it resynchronises after lost, flipped or foreign bytes."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
@@ -266,7 +266,7 @@ class ScipParser:
 
 
 class StatusMeaning(Enum):
-    """Action that a status requires of the host."""
+    """Action that a status requires from the host."""
 
     OK = auto()
     ALREADY = auto()
@@ -290,7 +290,7 @@ class StatusMeaning(Enum):
 
 
 def classify(command: str, status: str) -> StatusMeaning:
-    """Classify the ``status`` of a reply to ``command`` (its first characters suffice)."""
+    """Classify the ``status`` of a reply to ``command``, of which the first characters suffice."""
     if len(status) == 1:
         return StatusMeaning.OK if status == "0" else StatusMeaning.BAD_REQUEST
     shared = {
@@ -341,7 +341,7 @@ def decode_counter(line: bytes) -> int:
     """Parse the millisecond counter of a time line with its checksum.
 
     Raises:
-        ProtocolError: wrong sum or length.
+        ProtocolError: the checksum or the length is wrong.
     """
     if len(line) != 5 or line_sum(line[:4]) != line[4]:
         raise ProtocolError("SCIP: bad time line")
@@ -349,12 +349,12 @@ def decode_counter(line: bytes) -> int:
 
 
 def decode_scan(reply: Reply, start: int, end: int, cluster: int = 1) -> ScanBlock:
-    """Decode the block of a scan of steps ``start`` to ``end``.
+    """Decode a scan block for steps ``start`` to ``end``.
 
-    The last, partial cluster may be present or absent: the specification leaves it open.
+    The last, partial cluster may be present or absent: the specification does not say which.
 
     Raises:
-        ProtocolError: a wrong checksum, or a number of ranges other than requested.
+        ProtocolError: a checksum is wrong, or the number of ranges differs from the request.
     """
     name = reply.echo[:1] if reply.scip1 else reply.echo[:2]
     if name not in RANGE_WIDTH or (not reply.scip1 and len(reply.lines) < 2):
@@ -372,11 +372,12 @@ def split_ranges(values: NDArray[np.int32], least: int) -> tuple[NDArray[np.floa
     """Separate ranges from error codes.
 
     Args:
-        values: shape (n,), mm or codes.
+        values: shape (n,), mm or error codes.
         least: minimum range (mm, ``DMIN``); lower values are error codes.
 
     Returns:
-        Ranges in m, +inf where invalid, and codes, 255 where valid; both shape (n,), read-only for use in messages.
+        Ranges (m, +inf where invalid) and error codes (255 where valid), each of shape (n,) and read-only for use in
+        messages.
     """
     valid = values >= least
     ranges = np.where(valid, values / 1000.0, np.inf)
@@ -388,13 +389,13 @@ def split_ranges(values: NDArray[np.int32], least: int) -> tuple[NDArray[np.floa
 def split_lx_ranges(
     values: NDArray[np.int32], least: int, greatest: int, *, free: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Like ``split_ranges``, for the series UST and UTM: values outside their range are errors.
+    """Like ``split_ranges``, but for the UST and UTM series: values outside the measuring range are errors.
 
-    A UTM reports 1 where nothing is in range (table 4 of the SCIP 2.0 specification), a UST a value beyond its range.
-    Their other errors carry no information.
+    If nothing is in range, a UTM reports 1 (table 4 of the SCIP 2.0 specification) and a UST a value beyond its range.
+    Other error values carry no information.
 
     Args:
-        values: shape (n,), mm or errors.
+        values: shape (n,), mm or error values.
         least: minimum range (mm, ``DMIN``).
         greatest: maximum range (mm, ``DMAX``).
         free: whether a beam without a return is free up to the scanner's maximum range.
@@ -412,7 +413,7 @@ def split_lx_ranges(
 
 @dataclass(frozen=True, slots=True)
 class LidarIdentity:
-    """Answer to VV (or V)."""
+    """Reply to VV (or V)."""
 
     vendor: str
     product: str
@@ -423,7 +424,7 @@ class LidarIdentity:
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """Answer to PP: everything the geometry of a scan follows from."""
+    """Reply to PP: all parameters that define the scan geometry."""
 
     model: str
     least_mm: int
@@ -454,7 +455,7 @@ class Parameters:
 
 @dataclass(frozen=True, slots=True)
 class InternalState:
-    """Answer to II."""
+    """Reply to II."""
 
     laser_on: bool
     speed: str
@@ -471,8 +472,8 @@ SCIP1_PARAMETERS: Final = Parameters("URG-04LX", 20, 4095, 1024, 44, 725, 384, 6
 def parse_fields(lines: list[bytes], *, sums: bool = True) -> dict[str, str]:
     """Parse ``KEY:value;`` lines into a mapping.
 
-    Accepts a wrong checksum of SERI, which some units send, and a checksum that excludes the text after ``<-`` (II of
-    some models).
+    Accepts a wrong checksum on SERI, which some units send, and checksums that exclude the text after ``<-``, as in
+    some models' replies to II.
 
     Raises:
         ProtocolError: any other line has a wrong checksum, or a line is malformed.
@@ -493,7 +494,7 @@ def parse_fields(lines: list[bytes], *, sums: bool = True) -> dict[str, str]:
 
 
 def build_fields(fields: Mapping[str, str | int]) -> list[bytes]:
-    """Build lines ``KEY:value;`` as firmware 3.1 does: the checksum excludes the ``;``."""
+    """Build ``KEY:value;`` lines as firmware 3.1 does: the checksum excludes the ``;``."""
     lines = []
     for key, value in fields.items():
         text = f"{key}:{value}".encode("latin-1")
@@ -502,7 +503,7 @@ def build_fields(fields: Mapping[str, str | int]) -> list[bytes]:
 
 
 def parse_identity(fields: dict[str, str]) -> LidarIdentity:
-    """Parse the fields of VV; missing ones are empty, because old units omit some."""
+    """Parse the fields of VV; missing fields are empty, because old units omit some."""
     return LidarIdentity(*(fields.get(key, "") for key in ("VEND", "PROD", "FIRM", "PROT", "SERI")))
 
 
@@ -531,7 +532,7 @@ def parse_state(fields: dict[str, str]) -> InternalState:
     """Parse the fields of II.
 
     Raises:
-        ProtocolError: no hexadecimal TIME.
+        ProtocolError: TIME is missing or not hexadecimal.
     """
     try:
         counter = int(fields["TIME"], 16)

@@ -1,4 +1,4 @@
-"""Replay of a recorded drive by the emulated scanner: every scan once, at its recorded time."""
+"""Replay of a recorded drive by the emulated scanner: each scan is sent once, at its recorded time."""
 
 import asyncio
 from pathlib import Path
@@ -18,10 +18,10 @@ STEPS: Final = range(43, 726)
 
 
 class RecordedRanges:
-    """Scans of a recorded drive; a ``RangeSource`` after :meth:`start` has set its start time.
+    """Scans of a recorded drive; usable as a ``RangeSource`` once :meth:`start` has set the start time.
 
     Args:
-        times: shape (n,), ns since the first scan, increasing: step 0 of each revolution.
+        times: time of step 0 of each revolution (ns since the first scan), increasing, shape (n,).
         ranges: shape (n, 683), mm or error codes, steps 43..725.
     """
 
@@ -35,13 +35,13 @@ class RecordedRanges:
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read the text format of the BreezySLAM examples, gzipped or not.
+        """Read a text file, optionally gzipped, in the format of the BreezySLAM examples.
 
-        Each line is one scan of 707 blank-separated numbers: column 0 is the time in microseconds, 24..706 are ranges
+        Each line is one scan of 707 space-separated numbers: column 0 is the time in microseconds, 24..706 are ranges
         in mm.
 
         Raises:
-            InputError: the file does not exist or a line is not of this form.
+            InputError: the file does not exist or a line does not have this form.
         """
         times: list[int] = []
         rows: list[NDArray[np.int32]] = []
@@ -94,11 +94,11 @@ class RecordedHokuyoEmulator(HokuyoEmulator):
     The first request for a stream starts the recording, which then plays once, with or without a client.
 
     Args:
-        clock: the world's time.
-        recording: scans and their times.
-        seed: seed of the USB jitter.
-        state: initial state; ``streaming`` starts the recording at once.
-        options: further options of ``HokuyoEmulator``.
+        clock: world time.
+        recording: scans with their times.
+        seed: seed for the USB jitter.
+        state: initial state; ``streaming`` starts the recording immediately.
+        options: further ``HokuyoEmulator`` options.
     """
 
     def __init__(

@@ -1,1 +1,1 @@
-"""Health of the computer the daemon runs on."""
+"""Health of the computer that runs the daemon."""

@@ -42,7 +42,7 @@ class HostHealthConfig(Schema):
     disk_clear: Bytes = 1_500_000_000
     """Free space above which the shortage of disk space ends (bytes)."""
     disk_path: Path = Path("runs")
-    """Folder of the logs; it need not exist yet"""
+    """Log folder; it need not exist yet"""
 
     @model_validator(mode="after")
     def _clear_of_the_limits(self) -> Self:

@@ -1,4 +1,4 @@
-"""Host monitor: samples once a second and reports scarce resources."""
+"""Host monitor: samples the computer once a second and reports resource shortages."""
 
 from dataclasses import asdict
 from typing import Any, Final
@@ -59,8 +59,8 @@ class HostHealthDriver:
         """Sample until cancelled.
 
         Raises:
-            DeviceError: /proc cannot be read, or the free space of the disk is unknown.
-            ProtocolError: /proc differs from its documentation.
+            DeviceError: /proc cannot be read, or the free disk space cannot be determined.
+            ProtocolError: a /proc file does not have its documented format.
         """
         schedule = Schedule(self._clock, self._config.rate, Lead.IN_THREADS)
         while True:
@@ -120,7 +120,7 @@ async def identify(computer: Computer, clock: Clock, settings: HostHealthConfig)
     """Read the computer's health once.
 
     Returns:
-        JSON-able: the fields of ``Reading``.
+        JSON-compatible dict: the fields of ``Reading``.
 
     Raises:
         DeviceError: /proc cannot be read.

@@ -1,4 +1,4 @@
-"""Files of a small computer with four cores, as the kernel writes them."""
+"""Kernel files of a small four-core computer."""
 
 from pathlib import Path
 from typing import Final
@@ -12,14 +12,14 @@ CORES: Final = 4
 
 
 class HostEmulator(FaultyDevice):
-    """Board with one thermal zone, cpufreq, throttle counters and the Raspberry Pi's firmware word.
+    """Emulated board with one thermal zone, cpufreq, throttle counters and the Raspberry Pi firmware word.
 
-    Faults (``inject``): ``temperature C``, ``busy SHARE``, ``memory SHARE`` (available), ``cap SHARE`` (of the
-    clock), ``firmware HEX``, ``throttle`` (one more event of the counter), ``blind`` (no /sys at all), ``broken``
-    (/proc/stat is empty).
+    Faults (``inject``): ``temperature C``, ``busy SHARE``, ``memory SHARE`` (available), ``cap SHARE`` (of the clock),
+    ``firmware HEX``, ``throttle`` (increments the counter), ``blind`` (no /sys at all), ``broken`` (/proc/stat is
+    empty).
 
     Args:
-        root: folder that stands for /.
+        root: folder that replaces /.
         clock: time.
     """
 

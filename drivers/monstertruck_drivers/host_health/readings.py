@@ -1,8 +1,8 @@
-"""Read the computer's health from /proc and /sys; blocks while it reads small files.
+"""Read the computer's health from /proc and /sys; the functions block while they read small files.
 
-Source: kernel documentation, proc(5), ABI/testing/sysfs-class-thermal, admin-guide/pm/cpufreq, and for the throttle
-counters of x86 ABI/testing/sysfs-devices-system-cpu. ``get_throttled`` is the Raspberry Pi firmware's word: bits 0
-to 3 are under-voltage, capped, throttled and soft temperature limit, now.
+Source: kernel documentation, proc(5), ABI/testing/sysfs-class-thermal, admin-guide/pm/cpufreq, and
+ABI/testing/sysfs-devices-system-cpu for the x86 throttle counters. ``get_throttled`` is the Raspberry Pi firmware's
+word: bits 0 to 3 are the current under-voltage, capped, throttled and soft temperature limit states.
 """
 
 import os
@@ -20,7 +20,7 @@ FIRMWARE_THROTTLED: Final = "sys/devices/platform/soc/soc:firmware/get_throttled
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """Processor time since the start, in the kernel's ticks, all cores together."""
+    """Processor time of all cores since boot, in kernel ticks."""
 
     busy: int
     total: int
@@ -28,7 +28,7 @@ class Times:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """State of the computer at one instant; None: not available."""
+    """State of the computer at one instant; None for values that are not available."""
 
     load: float
     cores: int
@@ -57,8 +57,8 @@ def read_host(root: Path, disk: Disk) -> Reading:
         disk: the monitored file system.
 
     Raises:
-        DeviceError: no /proc.
-        ProtocolError: a file of /proc that every Linux has differs from proc(5).
+        DeviceError: /proc cannot be read.
+        ProtocolError: a /proc file that exists on every Linux system differs from proc(5).
     """
     cores, times = parse_stat(_required(root / "proc/stat"))
     total, available = parse_meminfo(_required(root / "proc/meminfo"))
@@ -81,7 +81,7 @@ def read_host(root: Path, disk: Disk) -> Reading:
 
 
 def parse_stat(text: str) -> tuple[int, Times]:
-    """Parse the cores and processor times of /proc/stat; waiting for a disk counts as idle.
+    """Parse the number of cores and the processor times from /proc/stat; waiting for a disk counts as idle.
 
     Raises:
         ProtocolError: the line ``cpu`` is missing or too short.
@@ -99,7 +99,7 @@ def parse_stat(text: str) -> tuple[int, Times]:
 
 
 def parse_meminfo(text: str) -> tuple[int, int]:
-    """Parse the total and available bytes of /proc/meminfo.
+    """Parse total and available memory (bytes) from /proc/meminfo.
 
     Raises:
         ProtocolError: a row is missing.
@@ -117,7 +117,7 @@ def parse_meminfo(text: str) -> tuple[int, int]:
 
 
 def busy_share(before: Times, now: Times) -> float | None:
-    """Fraction of the processor time between two readings that was busy; None if no time passed."""
+    """Busy fraction of the processor time between two readings; None if no time passed."""
     total = now.total - before.total
     return min(max((now.busy - before.busy) / total, 0.0), 1.0) if total > 0 else None
 

@@ -1,1 +1,1 @@
-"""I2C buses: of the kernel (``/dev/i2c-N``), and emulated behind a cable."""
+"""I2C buses: kernel buses (``/dev/i2c-N``), and emulated buses behind a cable."""

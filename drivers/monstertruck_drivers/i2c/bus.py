@@ -1,6 +1,6 @@
-"""Transfers over an I2C bus of the kernel; needs only the standard library, so that the stop script can use it.
+"""Transfers over a kernel I2C bus; needs only the standard library, so that the stop script can use it.
 
-Source: kernel documentation, i2c/dev-interface: ``I2C_RDWR`` joins messages by a repeated start.
+Source: kernel documentation, i2c/dev-interface: ``I2C_RDWR`` joins messages with a repeated start.
 """
 
 import ctypes
@@ -28,7 +28,7 @@ def limit_waits(bus: int) -> None:
     """Limit how long the adapter waits for a device that stretches the clock.
 
     Raises:
-        OSError: not an I2C bus.
+        OSError: ``bus`` is not an I2C bus.
     """
     fcntl.ioctl(bus, 0x0702, 5)  # I2C_TIMEOUT of one transfer, in 10 ms
 
@@ -39,8 +39,8 @@ def transfer(bus: int, address: int, data: bytes, count: int = 0) -> bytes:
     Args:
         bus: file descriptor of the bus.
         address: 7-bit address.
-        data: bytes to write; empty: only read.
-        count: bytes to read; 0 = only write.
+        data: bytes to write; if empty, only read.
+        count: number of bytes to read; if 0, only write.
 
     Raises:
         OSError: ENXIO or EREMOTEIO if the device does not acknowledge, ETIMEDOUT if the bus is held.

@@ -13,12 +13,12 @@ _NOT_ACKNOWLEDGED: Final = frozenset({errno.ENXIO, errno.EREMOTEIO})
 
 
 class I2cBus:
-    """Transfers with the devices on one bus, one at a time.
+    """Performs transfers with the devices on one bus, one at a time.
 
     Args:
         link: open link to the bus.
         clock: time.
-        timeout: timeout of one transfer (s).
+        timeout: timeout for one transfer (s).
     """
 
     def __init__(self, link: Link, clock: Clock, timeout: float) -> None:
@@ -34,7 +34,7 @@ class I2cBus:
 
         Raises:
             DeviceLostError: the bus is gone.
-            DeviceTimeoutError: the device does not acknowledge, or no answer within the timeout.
+            DeviceTimeoutError: the device does not acknowledge, or the answer did not arrive within the timeout.
         """
         self._number = (self._number + 1) % 256
         self._link.write(bytes(I2cRequest(self._number, address, data, count)))

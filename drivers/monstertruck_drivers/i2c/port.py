@@ -1,4 +1,4 @@
-"""Buses of the kernel. Each has a thread for its transfers, because a device may stretch the clock."""
+"""Kernel I2C buses. Each bus has its own transfer thread, because a device may stretch the clock."""
 
 import asyncio
 import errno
@@ -17,7 +17,7 @@ from monstertruck_runtime.errors import DeviceLostError
 
 
 class I2cPort:
-    """An I2C bus by its path, or an emulated one behind a pty. Other programs may use the bus at the same time.
+    """A kernel I2C bus, or an emulated one behind a pty. Other programs may use the bus at the same time.
 
     Args:
         path: device node, such as /dev/i2c-1.
@@ -28,10 +28,10 @@ class I2cPort:
         self._path = path
 
     async def open(self) -> Link:
-        """Open the bus; its link carries the packets of ``protocol``.
+        """Open the bus; the link carries packets as defined in ``protocol``.
 
         Raises:
-            DeviceLostError: no such node, no permission, or not an I2C bus.
+            DeviceLostError: the node does not exist, is not permitted, or is not an I2C bus.
             DeviceWedgedError: see ``SerialPort``.
             PortBusyError: another process holds the emulated bus.
         """
@@ -46,7 +46,7 @@ class I2cPort:
 
 
 def serve(name: str, file: int) -> Link:
-    """Return a link to the bus open as ``file``, which its thread closes after the link."""
+    """Return a link to the bus opened as ``file``; the bus thread closes the file after the link."""
     loop = asyncio.get_running_loop()
     waiting: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
     link = Link(name, waiting.put, lambda: waiting.put(None))

@@ -1,7 +1,7 @@
-"""Packets of one I2C transfer: a link carries them to the kernel's bus or to an emulated one.
+"""Packets for one I2C transfer; a link carries them to a kernel bus or an emulated bus.
 
-Request: mark, number, address, bytes to read, bytes written, those bytes. Answer: mark, number, error number of the
-kernel, bytes read, those bytes. A CRC-16 ends each.
+Request: mark, sequence number, address, number of bytes to read, number of bytes to write, the bytes to write. Answer:
+mark, sequence number, kernel error number, number of bytes read, the bytes read. Each packet ends with a CRC-16.
 """
 
 import errno
@@ -18,7 +18,7 @@ CRC_SIZE: Final = 2
 
 
 class I2cRequest(NamedTuple):
-    """One transfer."""
+    """Request for one transfer."""
 
     number: int
     """0..255; the answer repeats it."""
@@ -32,7 +32,7 @@ class I2cRequest(NamedTuple):
 
     @classmethod
     def of(cls, packet: bytes) -> "I2cRequest":
-        """Decode the fields of a whole packet."""
+        """Decode the fields of a complete packet."""
         return cls(packet[1], packet[2], packet[5:], packet[3])
 
 
@@ -49,7 +49,7 @@ class I2cAnswer(NamedTuple):
 
     @classmethod
     def of(cls, packet: bytes) -> "I2cAnswer":
-        """Decode the fields of a whole packet."""
+        """Decode the fields of a complete packet."""
         return cls(packet[1], packet[2], packet[4:])
 
 
@@ -61,7 +61,7 @@ HEADS: Final[dict[type, tuple[int, int]]] = {I2cRequest: (REQUEST_MARK, 5), I2cA
 
 @dataclass(slots=True)
 class Packets(Generic[P]):
-    """Incremental parser of one direction; skips damaged bytes.
+    """Incremental parser for one direction; skips damaged bytes.
 
     Args:
         kind: ``I2cRequest`` or ``I2cAnswer``.
@@ -102,7 +102,7 @@ None if no device acknowledges.
 
 
 async def serve(end: DeviceEnd, transfer: Transfer) -> None:
-    """Serve transfers until cancelled, at the speed of the bus."""
+    """Serve transfers until cancelled, at the real bus speed."""
     packets = Packets(I2cRequest)
     while True:
         for request in packets.feed(await end.read()):

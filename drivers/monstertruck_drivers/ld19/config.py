@@ -1,4 +1,4 @@
-"""Settings of the LD19 and its relatives."""
+"""Settings for the LD19 and related models."""
 
 from typing import Literal
 
@@ -8,7 +8,7 @@ from monstertruck_drivers.scanning.config import TurningHeadConfig
 
 
 class Ld19Config(TurningHeadConfig):
-    """LDROBOT LD06, LD19 or STL-19P: it streams from power-up and accepts no settings over its cable."""
+    """LDROBOT LD06, LD19 or STL-19P: the unit streams from power-up and accepts no settings over its cable."""
 
     kind: Literal["ld19"] = "ld19"
     model: Literal["ld06", "ld19", "stl19p"] = "ld19"

@@ -1,4 +1,4 @@
-"""Driver of the LD19: receives its stream and publishes every revolution."""
+"""LD19 driver: receives the unit's stream and publishes every revolution."""
 
 import numpy as np
 
@@ -28,12 +28,12 @@ from monstertruck_schemas.reasons import Reason
 
 
 def packet_stream(link: Link, clock: Clock) -> DeviceStream[Ld19Packet]:
-    """Return the packets of one session."""
+    """Return the packet stream of one session."""
     return DeviceStream(link, clock, Ld19Parser().feed, batch=4 * LD19_SIZE)
 
 
 async def first_packets(stream: DeviceStream[Ld19Packet]) -> list[Ld19Packet]:
-    """Wait for the first packets of a session; raises the errors of ``DeviceStream.first``."""
+    """Wait for the first packets of a session. Raises the same errors as ``DeviceStream.first``."""
     listen = 1.5  # seconds to receive a packet at the start; a unit is silent for half a second after power-up
     return await stream.first(listen, "of an LD19: another device, or another baud rate")
 
@@ -76,16 +76,17 @@ class PacketSamples:
 
 
 class Ld19Driver(ScannerDriver[Ld19Config]):
-    """LD06, LD19 or STL-19P on a port."""
+    """Driver for an LD06, LD19 or STL-19P on a port."""
 
     async def run(self, ready: Ready) -> None:
         """Serve one session.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: silence, a stationary head, or scans that arrive late for seconds.
-            ProtocolError: bytes without a packet.
-            WrongDeviceError: the bytes at the start contain no packet of an LD19.
+            DeviceLostError: the unit was unplugged.
+            DeviceTimeoutError: the unit is silent, its head does not turn, or its scans have arrived late for several
+                seconds.
+            ProtocolError: bytes arrive without a valid packet.
+            WrongDeviceError: the first bytes contain no LD19 packet.
             PortBusyError: another process holds the port.
         """
         config, sheet = self._config, MODELS[self._config.model].ranges
@@ -120,10 +121,10 @@ async def identify(link: Link, clock: Clock, settings: Ld19Config) -> dict[str, 
     """Wait for one packet, which does not name the model.
 
     Returns:
-        JSON-able: ``turns_per_second``, ``stamp_ms``, ``ranges_m``.
+        JSON-compatible dict: ``turns_per_second``, ``stamp_ms``, ``ranges_m``.
 
     Raises:
-        DeviceError: see the driver's ``run``.
+        DeviceError: the same errors as from the driver's ``run``.
     """
     packet = (await first_packets(packet_stream(link, clock)))[-1]
     return {

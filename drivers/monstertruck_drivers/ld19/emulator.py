@@ -1,4 +1,4 @@
-"""Device side of an LD19, byte for byte: silent after power-up, then spinning up, then streaming packets."""
+"""Emulated LD19, byte for byte: after power-up it is silent, then spins up, then streams packets."""
 
 import asyncio
 from typing import Final
@@ -33,14 +33,13 @@ COUNTER: Final = "counter"
 class Ld19Emulator(FaultyDevice):
     """LD06, LD19 or STL-19P that streams from power-up.
 
-    Faults (``inject``): ``silent on|off``, ``bad_crc N`` (the next N packets), ``half_packet``, and the faults of
-    the head.
+    Faults (``inject``): ``silent on|off``, ``bad_crc N`` (the next N packets), ``half_packet``, and the head's faults.
 
     Args:
         clock: time.
-        source: source of the ranges.
-        sheet: data sheet of the model.
-        seed: seed of covers.
+        source: range source.
+        sheet: the model's data sheet.
+        seed: seed for covers.
     """
 
     def __init__(self, clock: Clock, source: BeamSource, sheet: ModelSheet = MODELS["ld19"], *, seed: int = 0) -> None:
@@ -74,7 +73,7 @@ class Ld19Emulator(FaultyDevice):
                 self.received.extend(await end.read())
 
     def power_cycle(self) -> None:
-        """Switch the supply off and on: the clock starts at 0, the head is stationary."""
+        """Switch the supply off and on: the clock restarts at 0, and the head is stationary."""
         self.head.stop()
         self.faults["half_packet"] = 1
         self._powered_at = self.head.now()
@@ -116,6 +115,6 @@ class Ld19Emulator(FaultyDevice):
 
 
 def emulated(setup: EmulatorSetup) -> Ld19Emulator:
-    """Create the lidar of a simulated robot."""
+    """Create a simulated robot's lidar."""
     settings = setup.settings if isinstance(setup.settings, Ld19Config) else Ld19Config()
     return Ld19Emulator(setup.clock, setup.room, MODELS[settings.model], seed=setup.seed)

@@ -1,9 +1,9 @@
-"""Packets of LDROBOT's LD06, LD19 and STL-19P ("LD19 development manual", section 3).
+"""Packets of the LDROBOT LD06, LD19 and STL-19P ("LD19 development manual", section 3).
 
-A packet has 47 bytes, numbers with the low byte first: 0x54, 0x2C (the low five bits are the number of points, 12),
+A packet has 47 bytes, with numbers sent low byte first: 0x54, 0x2C (the low five bits are the number of points, 12),
 speed (degrees per second), start angle (0.01 degrees), twelve points of distance (mm) and intensity, end angle, time
-stamp (ms, wraps at 30000), and a CRC-8 of all bytes before it. Angles grow clockwise seen from above, 0 is
-straight ahead. The points between the first and the last are evenly spaced. The unit accepts no commands.
+stamp (ms, wraps at 30000), and a CRC-8 of all bytes before it. Angles increase clockwise seen from above; 0 is straight
+ahead. The points between the first and the last are evenly spaced. The unit accepts no commands.
 """
 
 import struct
@@ -46,7 +46,7 @@ MODELS: Final = {
 
 
 class Ld19Packet(NamedTuple):
-    """Raw numbers of one packet."""
+    """Raw values of one packet."""
 
     speed: int
     """Rotation speed (degrees/s)."""
@@ -82,7 +82,7 @@ _CRC: Final = _table()
 
 
 def crc8(data: bytes) -> int:
-    """CRC-8 with the polynomial 0x4D, high bit first, from 0."""
+    """CRC-8 with polynomial 0x4D, most significant bit first, initial value 0."""
     crc = 0
     for byte in data:
         crc = _CRC[crc ^ byte]
@@ -93,14 +93,14 @@ def build(packet: Ld19Packet) -> bytes:
     """Encode a packet.
 
     Raises:
-        struct.error: a number beyond 16 bits.
+        struct.error: a number exceeds 16 bits.
     """
     body = _PACKET.pack(HEADER, *packet, 0)[:-1]
     return body + bytes((crc8(body),))
 
 
 class Ld19Parser:
-    """Extracts packets from bytes; counts the bytes outside of packets."""
+    """Extracts packets from a byte stream; counts the bytes outside packets."""
 
     def __init__(self) -> None:
         self.refused = 0

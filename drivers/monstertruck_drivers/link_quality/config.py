@@ -15,7 +15,7 @@ class LinkQualityConfig(Schema):
 
     kind: Literal["link_quality"] = "link_quality"
     interface: Annotated[str, Field(pattern=r"^[^/\s]{1,15}$")] | None = None
-    """Name of the interface; None: the connected Wi-Fi, otherwise the connected cable"""
+    """Name of the interface; None selects the connected Wi-Fi interface, or else the connected wired one"""
     rate: Annotated[float, Field(gt=0, le=10)] = 1.0
     """Checks per second"""
     smoothing: Annotated[float, Field(ge=0, le=60)] = 4.0
@@ -29,7 +29,7 @@ class LinkQualityConfig(Schema):
     poor: Dbm = -85.0
     """Minimum poor signal (dBm); below it the link is unusable"""
     hysteresis: Annotated[float, Field(ge=0, le=20)] = 3.0
-    """Margin above a better level's limit before that level is reached again (dB)"""
+    """Margin above a better level's limit that the signal needs to reach that level again (dB)"""
 
     @model_validator(mode="after")
     def _limits_in_order(self) -> Self:

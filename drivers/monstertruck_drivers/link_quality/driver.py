@@ -15,7 +15,7 @@ from monstertruck_schemas.reasons import Reason
 
 
 class LinkJudge:
-    """Rates the link quality of the interface, which may change."""
+    """Rates the link quality of the monitored interface, which may change."""
 
     def __init__(self, config: LinkQualityConfig) -> None:
         self._smoothing = config.smoothing
@@ -37,7 +37,7 @@ class LinkJudge:
         """Smoothed signal (dBm); None if unknown."""
 
     def update(self, time_ns: int, sample: Sample | None) -> LinkLevel:
-        """Process one sample; None: the interface is missing."""
+        """Process one sample; None if the interface is missing."""
         if sample is None or not sample.connected:
             self._forget()
             return LinkLevel.DOWN
@@ -62,7 +62,7 @@ class LinkJudge:
         return level + (self.signal - level) * math.exp(-elapsed / self._smoothing)
 
     def _ranked(self, signal: float) -> int:
-        """Return the best level whose limit is reached; levels above the current one need a margin."""
+        """Return the best level whose limit is reached; a level above the current one also requires a margin."""
         for rank, (_, bound) in enumerate(self._bounds):
             climbing = self._rank is not None and rank < self._rank
             if signal >= bound + (self._hysteresis if climbing else 0.0):
@@ -81,11 +81,11 @@ FINE: Final = (Reason.OK, Severity.INFO)
 class LinkQualityDriver:
     """Publishes the link's quality and reports when it becomes weak, is lost or recovers.
 
-    Heartbeats, not the signal, decide whether a station is connected; the signal serves operators and planning.
+    Heartbeats, not the signal, decide whether a station is connected; the signal level informs operators and planning.
 
     Args:
         config: interface and limits.
-        computer: computer with the interfaces.
+        computer: computer that has the interfaces.
         clock: time.
         out: link health.
         events: degradations and recoveries.
@@ -113,7 +113,7 @@ class LinkQualityDriver:
         self._before: tuple[int, Sample] | None = None
 
     async def run(self, ready: Ready) -> None:
-        """Sample until cancelled; neither strange nor missing kernel output ends the session."""
+        """Sample until cancelled; unexpected or missing kernel output does not end the session."""
         schedule = Schedule(self._clock, self._config.rate, Lead.IN_THREADS)
         while True:
             await schedule.next()
@@ -156,7 +156,7 @@ class LinkQualityDriver:
         self._events(*concern, self.name, f"{name}: link is {level.value}", signal=self._judge.signal)
 
     def _rates(self, stamp: int, sample: Sample | None) -> tuple[float | None, float | None]:
-        """Receive and transmit rate (bytes/s) since the last reading of the same interface."""
+        """Receive and transmit rates (bytes/s) since the last reading of the same interface."""
         if self._before is None or sample is None:
             return None, None
         then, before = self._before
@@ -170,7 +170,7 @@ async def identify(computer: Computer, clock: Clock, settings: LinkQualityConfig
     """List the interfaces.
 
     Returns:
-        JSON-able: ``interfaces``, and ``chosen``: the interface monitored if none is configured.
+        JSON-compatible dict: ``interfaces`` and ``chosen``, the interface that is monitored if none is configured.
     """
     samples = await computer.machine.offload(lambda: read_interfaces(computer.root))
     chosen = choose(samples, None)

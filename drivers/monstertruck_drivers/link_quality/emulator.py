@@ -1,4 +1,4 @@
-"""Files of a Wi-Fi and a wired interface, as the kernel writes them."""
+"""Kernel files of a Wi-Fi and a wired interface."""
 
 from collections.abc import Callable
 from functools import partial
@@ -19,14 +19,14 @@ ON_AIR: Final = 20_000
 
 
 class NetworkEmulator(FaultyDevice):
-    """``wlan0`` with a signal, ``eth0`` with or without a cable, ``lo``.
+    """Emulated interfaces: ``wlan0`` with a signal, ``eth0`` with or without a cable, and ``lo``.
 
-    Faults (``inject``): ``signal DBM`` (from now on), ``style normal|no_dot|unsigned|header|missing`` (how
-    /proc/net/wireless is printed), ``wifi on|off``, ``cable on|off``, ``remove`` (the Wi-Fi stick is unplugged),
-    ``plug``, ``reset`` (counters restart at 0).
+    Faults (``inject``): ``signal DBM``, ``style normal|no_dot|unsigned|header|missing`` (how /proc/net/wireless is
+    printed), ``wifi on|off``, ``cable on|off``, ``remove`` (the Wi-Fi stick is unplugged), ``plug``, ``reset``
+    (counters restart at 0).
 
     Args:
-        root: folder that stands for /.
+        root: folder that replaces /.
         clock: time.
     """
 
@@ -54,7 +54,7 @@ class NetworkEmulator(FaultyDevice):
         self.write()
 
     async def run(self) -> None:
-        """Update the files with the signal until cancelled."""
+        """Keep the files up to date with the signal until cancelled."""
         signal_period = 0.5  # seconds between two changes of the signal
         while True:
             await self._clock.sleep(signal_period)

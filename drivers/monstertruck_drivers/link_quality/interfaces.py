@@ -1,4 +1,4 @@
-"""Read network interfaces from /sys/class/net and /proc/net/wireless; blocks while it reads small files.
+"""Read network interfaces from /sys/class/net and /proc/net/wireless; the functions block while they read small files.
 
 Source: kernel documentation, ABI/testing/sysfs-class-net, and the output of the kernel's wireless extensions.
 """
@@ -25,7 +25,7 @@ class Signal:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """An interface at one instant."""
+    """State of an interface at one instant."""
 
     name: str
     medium: LinkMedium
@@ -41,7 +41,7 @@ class Sample:
 
 
 def parse_wireless(text: str) -> dict[str, Signal]:
-    """Parse the rows by interface; header and damaged lines are skipped."""
+    """Parse the rows by interface, skipping header and damaged lines."""
     rows = {}
     for line in text.splitlines():
         name, colon, rest = line.partition(":")
@@ -57,14 +57,14 @@ def parse_wireless(text: str) -> dict[str, Signal]:
 
 
 def _dbm(value: int) -> float | None:
-    """Decode a level (dBm). Some drivers print the byte without its sign; 0 and -256 mean no value."""
+    """Decode a level (dBm). Some drivers print the byte without its sign; 0 and -256 mean that there is no value."""
     if value in (0, -256):
         return None
     return float(value - 256 if value > 63 else value)
 
 
 def read_interfaces(root: Path) -> list[Sample]:
-    """Read all Wi-Fi and wired interfaces, without bridges and other virtual ones.
+    """Read all Wi-Fi and wired interfaces, excluding bridges and other virtual interfaces.
 
     Args:
         root: folder that holds ``proc`` and ``sys``.
@@ -77,7 +77,7 @@ def read_interfaces(root: Path) -> list[Sample]:
 def choose(samples: list[Sample], name: str | None) -> Sample | None:
     """Return the named interface; without a name, the interface that the truck most likely uses.
 
-    Connected interfaces come before unconnected ones, then Wi-Fi before cable, because only Wi-Fi can become weak.
+    Connected interfaces are preferred to unconnected ones, then Wi-Fi to cable, because only Wi-Fi can become weak.
     """
     if name is not None:
         return next((sample for sample in samples if sample.name == name), None)

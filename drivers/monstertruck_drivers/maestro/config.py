@@ -24,7 +24,7 @@ class ServoConfig(ServoPulses):
     """Acceleration limit of the pulse (0.25 us per 10 ms per 80 ms); 0 = unlimited."""
 
     def quarters(self, angle: float) -> int:
-        """Target (quarter microseconds) for a servo angle (rad, left positive), clamped to all limits."""
+        """Target (quarter microseconds) for a servo angle (rad, left positive), clamped to every limit."""
         return round(4 * self.pulse_us(angle))
 
     def within_limits(self, quarters: int) -> bool:
@@ -33,12 +33,12 @@ class ServoConfig(ServoPulses):
         return 4 * self.min_us - rounding <= quarters <= 4 * self.max_us + rounding
 
     def angle(self, quarters: int) -> float:
-        """Servo angle (rad, left positive) of a pulse in quarter microseconds."""
+        """Servo angle (rad, left positive) for a pulse in quarter microseconds."""
         return self.angle_of(quarters / 4)
 
 
 class CurrentInputConfig(Schema):
-    """Sensor of the current into the pack: a Hall sensor on an analog input; the default is an ACS712 of 20 A."""
+    """Pack current sensor: a Hall sensor on an analog input; the default is a 20 A ACS712."""
 
     channel: Channel = 4
     """Analog input of the servo controller."""
@@ -56,7 +56,7 @@ class CurrentInputConfig(Schema):
 
 
 class BatteryInputConfig(PackConfig):
-    """Pack voltage through a divider on an analog input."""
+    """Pack voltage measured through a divider on an analog input."""
 
     channel: Channel = 5
     """Analog input of the servo controller."""
@@ -65,7 +65,7 @@ class BatteryInputConfig(PackConfig):
     multimeter.
     """
     gain: Annotated[float, Field(gt=0)] = 1.0
-    """Calibrated factor on the voltage."""
+    """Calibration factor for the voltage."""
     offset: float = 0.0
     """Offset added after the gain (V)."""
     current: CurrentInputConfig | None = None
@@ -125,7 +125,7 @@ class MaestroConfig(Schema):
 
     @property
     def steering_outputs(self) -> SteeringOutputs:
-        """Steering outputs of the servos."""
+        """Steering outputs driven by the servos."""
         return SteeringOutputs(tuple(servo.reach for servo in self.servos), self.dead_time, self.lag)
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""Steering driver: servo targets out; pulses, errors and battery voltage in."""
+"""Steering driver: sends servo targets; reads pulses, errors and the battery voltage."""
 
 import contextlib
 
@@ -19,27 +19,27 @@ from monstertruck_schemas.sensor import Battery, DriveFeedback, SteeringFeedback
 
 
 class MaestroDriver:
-    """Sends every steering command at once, and polls pulses, errors and battery in between.
+    """Sends every steering command immediately, and polls pulses, errors and the battery between commands.
 
     **Deadman.** The Maestro's serial timeout (set once in the unit, about 0.5 s) sends its channels home when no valid
-    command arrives; polling resets it as targets do. A command is stale ``command_timeout`` after its stamp. Then the
-    servos hold, and an explicit target releases the deadman line, if configured. With ``deadman_feed: fresh`` the
-    driver then sends nothing until the next command, so that the timeout trips as well although the driver still runs;
-    feedback and battery pause meanwhile. With ``always`` polling continues, and the timeout protects only against a
-    hung or dead process. Before the first command of a session the line is low and polling runs. The unit's settings
-    define where channels go: deadman line "Off", steering "Ignore". A command can also lower the line: nothing else
-    reaches a motor whose link is lost.
+    command arrives; polling resets the timeout just as targets do. A command is stale ``command_timeout`` after its
+    stamp. Then the servos hold, and an explicit target releases the deadman line, if configured. With ``deadman_feed:
+    fresh`` the driver then sends nothing until the next command, so that the timeout also trips although the driver
+    still runs; feedback and battery pause meanwhile. With ``always`` polling continues, and the timeout protects only
+    against a hung or dead process. Before the first command of a session, the line is low and polling is active. The
+    unit's settings define where channels go: deadman line "Off", steering "Ignore". A command can also lower the line,
+    which is the only way to stop a motor whose link is lost.
 
     Args:
         config: calibration and rates.
         port: the Maestro's Command Port.
-        clock: time, also the clock of the commands' stamps.
-        commands: steering commands of the gate.
-        out: feedback, angles as servo angles in rad, left positive.
+        clock: time source; commands are stamped with the same clock.
+        commands: steering commands from the gate.
+        out: feedback; servo angles in rad, left positive.
         battery: pack voltage; None if another device measures the battery.
-        events: errors of the device.
+        events: device errors.
         name: service name.
-        drive: motor feedback, whose current explains the battery's sag.
+        drive: motor feedback, whose current explains the battery sag.
     """
 
     def __init__(
@@ -79,9 +79,9 @@ class MaestroDriver:
         """Serve one session.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: no answers (three polls in a row); at the start: wrong mode or wrong port.
-            ProtocolError: malformed answers, three polls in a row.
+            DeviceLostError: the unit was unplugged.
+            DeviceTimeoutError: three consecutive polls got no answer; at the start, the mode or the port may be wrong.
+            ProtocolError: three consecutive answers were malformed.
             WrongDeviceError: another device answers on this port.
             PortBusyError: another process holds the port.
         """
@@ -129,7 +129,7 @@ class MaestroDriver:
         return self._clock.now() - command.stamp <= self._config.command_timeout * SECOND
 
     def _watch(self, session: MaestroSession) -> None:
-        """Release the deadman line when no commands arrive."""
+        """Release the deadman line when commands cease to arrive."""
         if self._fresh is not None and not self._is_fresh(self._fresh):
             self._fresh = None
             session.send(*self._line(session, high=False), *self._more(session, rest=True))
@@ -147,7 +147,7 @@ class MaestroDriver:
         return [] if channel is None else [session.encode.set_target(channel, line_high if high else 4000)]
 
     def _more(self, session: MaestroSession, *, rest: bool = False) -> list[bytes]:
-        """Commands to other devices on the unit; ``rest`` stops them."""
+        """Commands for other devices on the unit; ``rest`` stops those devices."""
         del session, rest
         return []
 
@@ -155,7 +155,7 @@ class MaestroDriver:
         """Publish the feedback of other devices after a poll."""
 
     def _restore(self, session: MaestroSession) -> None:
-        """Send all settings that a Maestro loses at power-up or by an error."""
+        """Send all settings that a Maestro loses at power-up or after an error."""
         packets: list[bytes] = []
         for servo in self._config.servos:
             packets.append(session.encode.set_speed(servo.channel, servo.speed))
@@ -227,7 +227,7 @@ class BatteryInput:
         self._monitor = monitor
 
     def take(self, stamp: int, received: int, raw: int, current: int | None = None) -> None:
-        """Process one 10-bit reading, and one of the current if it is measured."""
+        """Process one 10-bit voltage reading, and one current reading if the current is measured."""
         sensor = self._config.current
         amps = None if sensor is None or current is None else sensor.amps(current)
         self._monitor.take(stamp, received, self._config.volts(raw), at_limit=raw in (0, ADC_MAX), current=amps)

@@ -1,4 +1,4 @@
-"""Device side of a Micro Maestro, byte for byte."""
+"""Emulated Micro Maestro, byte for byte."""
 
 import asyncio
 import math
@@ -44,7 +44,7 @@ Home = float | Literal["off", "ignore"]
 
 @dataclass(slots=True)
 class Ramp:
-    """Pulse of one channel on its ramp to the target; all in quarter microseconds, velocity per 10 ms."""
+    """Pulse of one channel as it ramps to its target (quarter microseconds; velocity per 10 ms)."""
 
     target: int = 0
     position: float = 0.0
@@ -53,7 +53,7 @@ class Ramp:
     acceleration: int = 0
 
     def aim(self, target: int) -> None:
-        """Change the target. Without limits, and from or to 0 (no pulses), it is reached at once."""
+        """Change the target. Without limits, and from or to 0 (no pulses), the change is immediate."""
         if target == 0 or self.target == 0 or not (self.speed or self.acceleration):
             self.position, self.velocity = float(target), 0.0
         self.target = target
@@ -79,25 +79,26 @@ class MaestroEmulator(FaultyDevice):
     """A Micro Maestro 6 powered by USB.
 
     The arguments are settings in the unit's non-volatile memory; targets, speeds and accelerations are volatile.
-    Faults (``inject``): ``brown_out [seconds]``, ``at_junk``, ``mode dual_port|uart``, ``mute on|off`` (no
-    answers), ``late SECONDS [COUNT]`` (late answers), ``pulse CHANNEL MICROSECONDS`` (another program moves it beyond
-    its limits), ``error BIT``, ``rail VOLTS``, ``noise LSB``, ``battery VOLTS``.
+
+    Faults (``inject``): ``brown_out [seconds]``, ``at_junk``, ``mode dual_port|uart``, ``mute on|off`` (no answers),
+    ``late SECONDS [COUNT]`` (late answers), ``pulse CHANNEL MICROSECONDS`` (another program moves the pulse beyond its
+    limits), ``error BIT``, ``rail VOLTS``, ``noise LSB``, ``battery VOLTS``.
 
     Args:
         clock: time.
-        servos: physics; if None, the analog inputs read ``analog_v`` and the pulses move nothing.
-        seed: seed of the analog noise.
-        mode: serial mode; in ``uart`` (as from the factory) bytes over USB are ignored.
+        servos: servo physics; if None, the analog inputs read ``analog_v`` and the pulses have no effect.
+        seed: seed for the analog noise.
+        mode: serial mode; in ``uart`` (the factory setting), bytes over USB are ignored.
         crc: whether commands must carry a CRC-7 byte.
-        device_number: for the Pololu protocol.
-        serial_timeout_s: serial timeout (s): all channels then go home; 0 disables it.
-        home: per channel; default: outputs "off", others "ignore".
+        device_number: device number in the Pololu protocol.
+        serial_timeout_s: serial timeout (s), after which all channels go home; 0 disables it.
+        home: home setting for each channel; default: "off" for outputs, "ignore" for others.
         inputs: channels that are analog inputs.
         outputs: channels that are digital outputs.
         limits_us: minimum and maximum pulse (us); targets are clamped.
         noise_lsb: standard deviation of the analog noise.
         rail_drift_v: amplitude of a slow (60 s) swing of the 5 V rail, the reference of the inputs.
-        usb: port of the unit; a brown-out unplugs and replugs it.
+        usb: the unit's port; a brown-out unplugs and replugs it.
         on_output: called with (channel, high) when a digital output changes, whatever the cause.
     """
 
@@ -185,7 +186,7 @@ class MaestroEmulator(FaultyDevice):
         self._report_outputs()
 
     def set_serial_timeout(self, seconds: float) -> None:
-        """Store the serial timeout (s): all channels then go home; 0 disables it."""
+        """Store the serial timeout (s), after which all channels go home; 0 disables it."""
         self._timeout = round(seconds * SECOND)
 
     # Interface to the simulated world
@@ -201,7 +202,7 @@ class MaestroEmulator(FaultyDevice):
         return channel in self._outputs and self._ramps[channel].target >= OUTPUT_THRESHOLD
 
     def power_cycle(self) -> None:
-        """Switch the supply off and on: targets, speeds and errors are lost, settings stay."""
+        """Switch the supply off and on: targets, speeds and errors are lost; settings persist."""
         self._advance()
         self._boot()
         self._fed_again.set()
@@ -361,7 +362,7 @@ class MaestroEmulator(FaultyDevice):
                 ramp.step()
 
     async def _watch(self) -> None:
-        """Serial timeout: it trips when no valid command arrives, even while the host is silent."""
+        """Run the serial timeout, which trips when no valid command arrives, even while the host is silent."""
         while self._timeout:
             self._fed_again.clear()
             if self._timed_out:
@@ -379,7 +380,7 @@ class MaestroEmulator(FaultyDevice):
         self.power_cycle()
 
     def _brown_out(self, seconds: str = "0.5") -> None:
-        """Simulate a brown-out by a stalled servo: the unit leaves USB and returns without its volatile state."""
+        """Simulate a brown-out due to a stalled servo: the unit leaves USB and returns without its volatile state."""
         if self.usb is None:
             self.power_cycle()
         else:
@@ -388,6 +389,6 @@ class MaestroEmulator(FaultyDevice):
 
 
 def emulated(setup: EmulatorSetup) -> MaestroEmulator:
-    """Create the servo controller of a simulated truck."""
+    """Create a simulated truck's servo controller."""
     servos = setup.physics.servos
     return MaestroEmulator(setup.clock, servos, seed=setup.seed, inputs=servos.inputs)

@@ -1,4 +1,4 @@
-"""Settings of a radio-control speed controller (ESC) on a channel of a Maestro that also steers."""
+"""Settings for a radio-control speed controller (ESC) on a channel of a Maestro that also steers."""
 
 from typing import Literal, Self
 
@@ -31,17 +31,17 @@ class MaestroEscConfig(Schema):
 
     @property
     def motor_limits(self) -> MotorLimits:
-        """Limits of the motor."""
+        """Motor limits."""
         return self.esc.motor_limits
 
     @property
     def steering_outputs(self) -> SteeringOutputs:
-        """Steering outputs of the servos."""
+        """Steering outputs driven by the servos."""
         return self.unit.steering_outputs
 
     @property
     def battery(self) -> BatteryInputConfig | None:
-        """Battery input of the unit."""
+        """The unit's battery input."""
         return self.unit.battery
 
     @property

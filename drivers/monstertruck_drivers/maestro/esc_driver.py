@@ -1,9 +1,9 @@
-"""Driver of a Maestro with a speed controller (ESC) on one of its channels: drives, steers, and measures the battery.
+"""Driver for a Maestro with a speed controller (ESC) on one of its channels: drives, steers, and measures the battery.
 
-The pulse follows every command that the gate sends to the servos, so a stop waits for the next tick. The pulse becomes
-neutral when commands are stale and at the start and end of a session. The unit's serial timeout is the watchdog: it
-must send this channel to the neutral pulse. The motor is not measured: the reported rate is the commanded rate, delayed
-as configured.
+The pulse follows every command that the gate sends to the servos, so a stop waits until the next tick. The pulse
+becomes neutral when commands are stale and at the start and end of a session. The unit's serial timeout is the
+watchdog: it must send this channel to the neutral pulse. The motor is not measured: the reported rate is the commanded
+rate, delayed as configured.
 """
 
 from typing import Unpack
@@ -22,18 +22,18 @@ from monstertruck_schemas.sensor import Battery, DriveFeedback, SteeringFeedback
 
 
 class MaestroEscDriver(MaestroDriver):
-    """Sends the speed controller's pulse along with the servos'.
+    """Sends the speed controller's pulse along with the servo pulses.
 
     Args:
-        config: speed controller and unit.
+        config: speed controller and Maestro settings.
         port: the Maestro's Command Port.
         clock: time.
         steering_commands: ``cmd/steering``.
         drive: this driver's own feedback; it has no current.
-        steering: pulses being sent, as servo angles.
+        steering: current pulses, as servo angles.
         battery: pack voltage; None if another device measures the battery.
-        events: errors of the device.
-        name: name of the service.
+        events: device errors.
+        name: service name.
         ends: topics of the shafts; there is one motor, whose rate is published as commanded.
     """
 
@@ -58,7 +58,7 @@ class MaestroEscDriver(MaestroDriver):
         self._motor = UnmeasuredMotor(config.esc, clock, ends["commands"], ends["out"], config.command_timeout)
 
     async def run(self, ready: Ready) -> None:
-        """Serve one session; raises the errors of ``MaestroDriver.run``."""
+        """Serve one session. Raises the same errors as ``MaestroDriver.run``."""
         self._motor.begin()
         await super().run(ready)
 

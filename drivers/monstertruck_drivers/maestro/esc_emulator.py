@@ -18,9 +18,9 @@ class MaestroEscEmulator(MaestroEmulator):
     Args:
         clock: time.
         plant: the motor.
-        servos: physics of the servos.
+        servos: servo physics.
         settings: channels and pulses.
-        seed: seed of the analog noise.
+        seed: seed for the analog noise.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class MaestroEscEmulator(MaestroEmulator):
         )
 
     async def run(self, end: DeviceEnd) -> None:
-        """Serve the Command Port, and run the speed controller on its pulses."""
+        """Serve the Command Port, and run the speed controller from its pulses."""
         async with asyncio.TaskGroup() as group:
             group.create_task(self._esc.run())
             await super().run(end)
@@ -56,7 +56,7 @@ class MaestroEscEmulator(MaestroEmulator):
 
 
 def emulated(setup: EmulatorSetup) -> MaestroEscEmulator:
-    """Create the servo and speed controller of a simulated robot."""
+    """Create a simulated robot's servo and speed controller."""
     return MaestroEscEmulator(
         setup.clock, setup.physics.motors[0], setup.physics.servos, setup.settings, seed=setup.seed
     )

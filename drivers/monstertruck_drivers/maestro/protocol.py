@@ -1,4 +1,4 @@
-"""Bytes of the Maestro's serial protocol: compact and Pololu forms, CRC-7, error bits.
+"""Maestro serial protocol: compact and Pololu forms, CRC-7, error bits.
 
 Source: Maestro user's guide, sections 5.c (protocols), 5.d (CRC), 5.e (commands), 4.e (errors).
 """
@@ -20,7 +20,7 @@ ERROR_MASK: Final = 0x01FF
 
 
 class Error(IntFlag):
-    """Bits of the error word; reading it clears it."""
+    """Bits of the error word, which is cleared when read."""
 
     SERIAL_SIGNAL = 1 << 0
     SERIAL_OVERRUN = 1 << 1
@@ -34,7 +34,7 @@ class Error(IntFlag):
 
 
 class Code(IntEnum):
-    """Command bytes in compact form."""
+    """Command bytes in the compact form."""
 
     SET_TARGET = 0x84
     SET_SPEED = 0x87
@@ -68,14 +68,14 @@ DATA_BYTES: Final[dict[int, int]] = {
 
 
 def error_names(word: int) -> list[str]:
-    """Names of the bits set in an error word; unknown bits as hexadecimal."""
+    """Names of the bits set in an error word; unknown bits are given in hexadecimal."""
     names = [(bit.name or "").lower() for bit in Error if word & bit]
     unknown = word & ~ERROR_MASK
     return [*names, hex(unknown)] if unknown else names
 
 
 def crc7(data: bytes) -> int:
-    """CRC-7 of a whole command: polynomial 0x91, least significant bit first, start 0."""
+    """CRC-7 of a complete command: polynomial 0x91, least significant bit first, initial value 0."""
     crc = 0
     for byte in data:
         crc ^= byte
@@ -88,7 +88,7 @@ def halves(value: int) -> tuple[int, int]:
     """Low and high seven bits of a 14-bit value.
 
     Raises:
-        ValueError: outside 0..16383.
+        ValueError: the value is outside 0..16383.
     """
     if not 0 <= value <= POSITION_MAX:
         raise ValueError(f"{value} does not fit 14 bits")
@@ -105,8 +105,8 @@ class Encoder:
     """Builds commands.
 
     Args:
-        device: device number for the Pololu form; None: compact form.
-        crc: append the CRC-7 byte.
+        device: device number for the Pololu form; None for the compact form.
+        crc: whether to append the CRC-7 byte.
     """
 
     device: int | None = None
@@ -123,19 +123,19 @@ class Encoder:
         return self.command(Code.SET_TARGET, channel, *halves(quarters))
 
     def set_speed(self, channel: int, speed: int) -> bytes:
-        """Encode a speed limit (0.25 us per 10 ms); 0 = unlimited."""
+        """Encode a speed limit (0.25 us per 10 ms); 0 means unlimited."""
         return self.command(Code.SET_SPEED, channel, *halves(speed))
 
     def set_acceleration(self, channel: int, acceleration: int) -> bytes:
-        """Encode an acceleration limit (0.25 us per 10 ms per 80 ms), 0..255; 0 = unlimited."""
+        """Encode an acceleration limit (0.25 us per 10 ms per 80 ms), 0..255; 0 means unlimited."""
         return self.command(Code.SET_ACCELERATION, channel, *halves(acceleration))
 
     def get_position(self, channel: int) -> bytes:
-        """Request the pulse being sent (quarter microseconds) or the input's 10-bit value; the answer has two bytes."""
+        """Request the current pulse (quarter microseconds) or the input's 10-bit value; the answer has two bytes."""
         return self.command(Code.GET_POSITION, channel)
 
     def get_errors(self) -> bytes:
-        """Request the error word, which clears it; the answer has two bytes."""
+        """Request the error word, which the request clears; the answer has two bytes."""
         return self.command(Code.GET_ERRORS)
 
 
@@ -153,11 +153,11 @@ class ServoCommand(NamedTuple):
 
 @dataclass(slots=True)
 class Decoder:
-    """Device side: parses bytes, in chunks of any size, into commands and errors.
+    """Device-side parser: turns bytes, in chunks of any size, into commands and errors.
 
     Args:
-        device: own device number; Pololu packets for others are skipped.
-        crc: expect a CRC-7 byte after every command.
+        device: own device number; Pololu packets for other devices are skipped.
+        crc: whether a CRC-7 byte follows every command.
     """
 
     device: int = 12

@@ -1,4 +1,4 @@
-"""Requests and replies of a Maestro over one open link; shared by the driver and `identify`."""
+"""Requests to a Maestro and its replies over one open link; shared by the driver and `identify`."""
 
 from monstertruck_drivers.link import Link
 from monstertruck_drivers.maestro.config import MaestroConfig
@@ -15,7 +15,7 @@ class MaestroSession:
         link: open link to the Command Port.
         clock: time.
         encoder: protocol form.
-        timeout: timeout of the answers to one request (s).
+        timeout: timeout for the answers to one request (s).
     """
 
     def __init__(self, link: Link, clock: Clock, encoder: Encoder, timeout: float) -> None:
@@ -30,7 +30,7 @@ class MaestroSession:
         """Send commands that have no answer.
 
         Raises:
-            DeviceLostError: unplugged.
+            DeviceLostError: the unit was unplugged.
         """
         self._link.write(b"".join(commands))
 
@@ -38,7 +38,7 @@ class MaestroSession:
         """Send requests together and collect a 16-bit word for each.
 
         Raises:
-            DeviceLostError: unplugged.
+            DeviceLostError: the unit was unplugged.
             DeviceTimeoutError: answers are missing.
         """
         if not self._in_step or self._link.discard():
@@ -57,7 +57,7 @@ class MaestroSession:
         """Discard late answers: wait for silence, then for exactly the answer to a request of known length.
 
         Raises:
-            DeviceTimeoutError: that answer is missing, or more arrives than that.
+            DeviceTimeoutError: the answer is missing, or further bytes arrive.
         """
         self._in_step = False
         # Attempts to resynchronise with the answers.
@@ -75,14 +75,14 @@ class MaestroSession:
         raise DeviceTimeoutError(f"{self._link.name}: answers remain out of step with requests")
 
     async def identify(self, *channels: int) -> int:
-        """Make sure that a Maestro answers, reading its errors and the positions of ``channels``.
+        """Verify that a Maestro answers by reading its errors and the positions of ``channels``.
 
         Returns:
-            The error word that was pending; it is cleared now.
+            The pending error word, which is now cleared.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: silence.
+            DeviceLostError: the unit was unplugged.
+            DeviceTimeoutError: the unit does not answer.
             WrongDeviceError: bytes arrived that a Maestro does not send.
         """
         heard = False
@@ -112,7 +112,7 @@ class MaestroSession:
         )
 
     async def _speaks(self) -> bool:
-        """Whether unrequested bytes arrive; they are dropped."""
+        """Whether unrequested bytes arrive; these bytes are dropped."""
         try:
             # Silence that ends an answer (s); a Maestro sends nothing without a request.
             async with self._clock.deadline(0.02):
@@ -124,7 +124,7 @@ class MaestroSession:
         """Reject words that cannot be the requested values.
 
         Raises:
-            ProtocolError: malformed, as after a lost byte.
+            ProtocolError: a word is malformed, as after a lost byte.
         """
         if errors > ERROR_MASK or any(position > POSITION_MAX for position in positions):
             raise ProtocolError(f"{self._link.name}: malformed answers: errors {errors:#x}, positions {positions}")
@@ -140,15 +140,15 @@ class MaestroSession:
 
 
 async def identify(link: Link, clock: Clock, settings: MaestroConfig | MaestroEscConfig) -> dict[str, object]:
-    """Read the error word, which clears it, and all channels, with compact commands without CRC.
+    """Read the error word, thereby clearing it, and all channels, using compact commands without CRC.
 
     Returns:
-        JSON-able: ``errors`` that were pending, ``channels``: for each channel the pulse in microseconds if it is a
-        servo (0 = off), and the voltage at the pin if it is an input.
+        JSON-compatible dict: ``errors`` (pending before the read) and ``channels``, which holds the pulse in
+        microseconds for each servo (0: off) and the pin voltage for each input.
 
     Raises:
-        DeviceTimeoutError: silence; the text names what to check.
-        WrongDeviceError: another device.
+        DeviceTimeoutError: nothing answers; the message names what to check.
+        WrongDeviceError: another device answers.
     """
     session = MaestroSession(link, clock, Encoder(), timeout=0.3)
     errors = await session.identify(0, 1)

@@ -1,4 +1,4 @@
-"""Settings of a camera that sends motion JPEG over a link."""
+"""Settings for a camera that sends motion JPEG over a link."""
 
 from typing import Annotated, Literal, Self
 
@@ -42,5 +42,5 @@ class MjpegConfig(Schema):
 
     @property
     def buffers(self) -> int:
-        """Number of pictures kept: the latest."""
+        """Number of latest pictures that are kept."""
         return 1

@@ -1,4 +1,4 @@
-"""Driver of a camera that sends motion JPEG over a link."""
+"""Driver for a camera that sends motion JPEG over a link."""
 
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.mjpeg.config import MjpegConfig
@@ -10,14 +10,14 @@ from monstertruck_schemas.sensor import CompressedImage
 
 
 class MjpegDriver(WebcamDriver):
-    """Publishes every complete picture, stamped with its arrival minus the configured delay.
+    """Publishes every complete picture, stamped with its arrival time minus the configured delay.
 
     Args:
-        config: settings of the camera.
+        config: camera settings.
         port: program, TCP port or emulated camera.
         clock: time.
         out: pictures.
-        events: deviating sizes, rejected pictures.
+        events: unexpected picture sizes and rejected pictures.
         name: service name.
     """
 
@@ -33,13 +33,14 @@ class MjpegDriver(WebcamDriver):
         super().__init__(config, LinkSource(config, port, clock), clock, out, events, name)
 
     async def run(self, ready: Ready) -> None:
-        """Serve one session; it is ready with its first whole picture.
+        """Serve one session, which is ready once the first complete picture has arrived.
 
         Raises:
-            DeviceLostError: the program cannot be started, or it ended; no server, or it closed the connection.
-            DeviceTimeoutError: no picture within ``watchdog``.
+            DeviceLostError: the program cannot be started or has ended, or the server is absent or closed the
+                connection.
+            DeviceTimeoutError: no picture arrived within ``watchdog``.
             DeviceMismatchError: the server refuses the path.
-            WrongDeviceError: the server sends other content than pictures.
-            ProtocolError: no HTTP, or no complete picture within that time.
+            WrongDeviceError: the server sends content other than pictures.
+            ProtocolError: the answer is not HTTP, or no complete picture arrived within that time.
         """
         await super().run(ready)

@@ -21,7 +21,7 @@ CHUNK: Final = 4095
 
 
 class MjpegEmulator(FaultyDevice):
-    """Camera of a program or of a server; a server serves its latest client.
+    """Camera behind a program or a server; a server serves its latest client.
 
     Faults (``inject``): ``corrupt N`` (a header is overwritten), ``truncate N`` (the second half is missing),
     ``oversize N`` (endless zeros), ``stuck on|off`` (sends nothing), ``status CODE|off`` (the server refuses),
@@ -29,9 +29,9 @@ class MjpegEmulator(FaultyDevice):
 
     Args:
         clock: time.
-        view: source of the pictures.
+        view: source of the images.
         settings: size, rate, with or without HTTP.
-        offload: runs the drawing: in a thread, or ``inline`` on the virtual clock.
+        offload: runs the rendering in a thread, or ``inline`` with the virtual clock.
     """
 
     def __init__(
@@ -133,5 +133,5 @@ class MjpegEmulator(FaultyDevice):
 
 
 def emulated(setup: EmulatorSetup) -> MjpegEmulator:
-    """Create the camera of a simulated robot."""
+    """Create a simulated robot's camera."""
     return MjpegEmulator(setup.clock, setup.physics.view, setup.settings, offload=setup.offload)

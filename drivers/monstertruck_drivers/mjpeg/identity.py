@@ -22,10 +22,10 @@ async def identify(link: Link, clock: Clock, settings: MjpegConfig) -> dict[str,
     """Take one picture.
 
     Returns:
-        JSON-able: ``width`` and ``height`` (pixels), ``bytes``.
+        JSON-compatible dict: ``width`` and ``height`` (pixels), ``bytes``.
 
     Raises:
-        DeviceError: see the driver's ``run``.
+        DeviceError: the same errors as from the driver's ``run``.
     """
     source = LinkSource(settings, _OpenPort(link), clock)
     async with await source.open(Mode(settings.width, settings.height, settings.rate), settings.buffers) as stream:

@@ -1,4 +1,4 @@
-"""Parsers of pictures in a byte stream, and of the answer of an HTTP server that sends them.
+"""Parsers for pictures in a byte stream, and for the HTTP response that carries them.
 
 Sources: ITU-T T.81, annex B (markers); RFC 9112 (message format, chunked coding); RFC 2046, 5.1 (multipart, whose
 headers are skipped as bytes between pictures).
@@ -19,7 +19,7 @@ HEAD_MOST: Final = 8192
 
 @dataclass(slots=True)
 class PictureSplitter:
-    """Incremental parser of pictures; it also returns truncated ones, for the caller to reject.
+    """Incremental picture parser; it also returns truncated pictures, which the caller must reject.
 
     Args:
         most: maximum length of a picture (bytes).
@@ -44,7 +44,7 @@ class PictureSplitter:
             del self._buffer[:end]
 
     def _end(self) -> int | None:
-        """End of the first picture; None if it has not arrived yet."""
+        """End offset of the first picture; None if it has not arrived yet."""
         buffer, at = self._buffer, len(SOI)
         while at + 4 <= len(buffer):
             if buffer[at] != 0xFF:
@@ -83,7 +83,7 @@ def request(path: str, host: str) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class HttpHead:
-    """Head of an answer."""
+    """Head of an HTTP response."""
 
     status: int
     reason: str
@@ -98,7 +98,7 @@ class HttpHead:
         """Decode a head without its final empty line.
 
         Raises:
-            ValueError: not the answer of an HTTP server.
+            ValueError: the head is not from an HTTP response.
         """
         first, *lines = head.decode("latin-1").split("\r\n")
         if (status := re.fullmatch(r"HTTP/1\.[01] (\d{3})(?: (.*))?", first)) is None:
@@ -112,7 +112,7 @@ class HttpHead:
 
 @dataclass(slots=True)
 class Dechunker:
-    """Incremental decoder of the chunked transfer coding."""
+    """Incremental decoder for the chunked transfer coding."""
 
     ended: bool = False
     """Whether the last chunk has arrived."""

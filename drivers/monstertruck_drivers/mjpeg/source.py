@@ -32,7 +32,7 @@ class LinkSource:
     """Camera behind a port.
 
     Args:
-        config: settings of the camera.
+        config: camera settings.
         port: program, TCP port or emulated camera.
         clock: time.
     """
@@ -44,14 +44,14 @@ class LinkSource:
         self._clock = clock
 
     async def open(self, mode: Mode, buffers: int) -> FrameStream:
-        """Connect and wait for a picture, whose size is taken as the granted mode; see ``FrameSource``.
+        """Connect and wait for a picture; its size becomes the granted mode. See ``FrameSource``.
 
         Raises:
-            DeviceLostError: the program or server is missing, or it ended.
-            DeviceTimeoutError: no picture within ``watchdog``.
+            DeviceLostError: the program or server is missing or has ended.
+            DeviceTimeoutError: no picture arrived within ``watchdog``.
             DeviceMismatchError: the server refuses the path.
-            WrongDeviceError: the server sends other content than pictures.
-            ProtocolError: no HTTP.
+            WrongDeviceError: the server sends content other than pictures.
+            ProtocolError: the answer is not HTTP.
         """
         del buffers
         stream = _Polled(self, mode) if self._config.poll is not None else _Streamed(self, mode)
@@ -67,7 +67,7 @@ class LinkSource:
         return stream
 
     async def connect(self) -> "_Connection":
-        """Open the port and, with HTTP, send the request and read the answer's header; raises as ``open``."""
+        """Open the port and, with HTTP, send the request and read the header; raises the same errors as ``open``."""
         link = await self._port.open()
         if self._config.http is None:
             return _Connection(self.name, link)
@@ -98,7 +98,7 @@ class LinkSource:
         return found
 
     def frame(self, number: int, data: bytes) -> CameraFrame:
-        """Return a frame that arrived now."""
+        """Return a frame stamped as having just arrived."""
         return CameraFrame(self._clock.now() - round(self._config.delay * SECOND), number, data)
 
     def splitter(self) -> PictureSplitter:
@@ -111,7 +111,7 @@ class LinkSource:
 
 
 class _Connection:
-    """Connection for one answer."""
+    """Connection for one response."""
 
     def __init__(self, name: str, link: Link, head: HttpHead | None = None, rest: bytes = b"") -> None:
         self.link = link
@@ -122,7 +122,7 @@ class _Connection:
 
     @property
     def ended(self) -> bool:
-        """Whether all content has arrived, by its length or the last chunk."""
+        """Whether all content has arrived, according to its length or the last chunk."""
         return self._left == 0 or (self._chunks is not None and self._chunks.ended)
 
     async def read(self) -> bytes:
@@ -139,7 +139,7 @@ class _Connection:
 
 
 class _Pictures(ABC):
-    """Base of both streams; it takes the first picture at the start, and the first ``next`` returns it."""
+    """Base class of both streams; it receives a picture on opening, which the first ``next`` returns."""
 
     def __init__(self, source: LinkSource, mode: Mode) -> None:
         self.mode = mode
@@ -155,7 +155,7 @@ class _Pictures(ABC):
             self.mode = Mode(*size, self.mode.rate)
 
     async def next(self) -> CameraFrame:
-        """Wait for a picture, see ``FrameStream``."""
+        """Wait for a picture; see ``FrameStream``."""
         frame, self._first = self._first, None
         return frame or await self._take()
 

@@ -16,13 +16,13 @@ Real = TypeVar("Real", float, NDArray[np.float64])
 def level_field(field: tuple[Real, Real, Real], pitch: Real, roll: Real, iron: IronConfig) -> tuple[Real, Real]:
     """Return the horizontal component of the earth's field (forward, left), compensated for tilt.
 
-    Its angle is the heading, clockwise from magnetic north: north lies to the left of a truck that has turned right.
+    Its angle is the heading, clockwise from magnetic north: after a right turn, north is to the truck's left.
 
     Args:
-        field: measured along the device's x (forward), y (left), z (up).
+        field: measured along the device's x (forward), y (left) and z (up) axes.
         pitch: nose down positive (REP 103) (rad).
         roll: right side down positive (rad).
-        iron: calibration to apply; hard iron in the unit of ``field``.
+        iron: calibration to apply; hard iron in the same unit as ``field``.
     """
     x, y = field[0] - iron.hard_x, field[1] - iron.hard_y
     x, y = iron.soft_xx * x + iron.soft_xy * y, iron.soft_xy * x + iron.soft_yy * y
@@ -38,15 +38,16 @@ MILLIGAUSS: Final = 0.1
 def to_attitude(sentence: Sentence, config: Os4000Config, stamp: int, received: int, seq: int) -> Attitude:
     """Convert one sentence.
 
-    The device counts pitch nose up and roll right side down; REP 103 counts pitch nose DOWN (about y, left) and
-    roll right side down (about x, forward), so that only pitch changes its sign. Its acceleration is +1 g along z
-    (up) at rest, with x forward and y left (as a sample of the manufacturer with pitch 2.5 and roll -14 degrees shows).
+    In the device's convention, positive pitch is nose up and positive roll is right side down; in REP 103, positive
+    pitch is nose DOWN (about y, left) and positive roll is right side down (about x, forward), so only pitch changes
+    sign. Its acceleration is +1 g along z (up) at rest, with x forward and y left (confirmed by a manufacturer's sample
+    with pitch 2.5 and roll -14 degrees).
 
-    With a calibrated ``iron`` the heading comes from the field instead; ``magnetic_field`` stays as measured.
+    With a calibrated ``iron``, the heading is computed from the field instead; ``magnetic_field`` remains as measured.
 
     Raises:
-        ValueError: heading, pitch or roll (or the field, where it is needed) is absent or out of range; the text names
-            it.
+        ValueError: heading, pitch or roll (or the field, where it is needed) is absent or out of range; the message
+            names the value.
     """
     heading, pitch, roll = sentence.heading, sentence.pitch, sentence.roll
     if heading is None or not 0 <= heading < 360:

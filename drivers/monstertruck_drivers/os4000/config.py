@@ -12,7 +12,7 @@ NEEDED = Fields.HEADING | Fields.PITCH | Fields.ROLL
 
 
 class IronConfig(Schema):
-    """Compensation of the truck's own magnetism in the measured field: ``soft (field - hard)``, device axes.
+    """Compensation of the truck's own magnetism in the measured field: ``soft (field - hard)``, in device axes.
 
     Calibrated on level ground: the vertical field is unchanged, and ``soft`` is scaled to determinant 1. With the
     default values the driver uses the unit's own heading; with other values it computes the heading.
@@ -39,7 +39,7 @@ class IronConfig(Schema):
 class Os4000Config(Schema):
     """OceanServer OS4000 compass.
 
-    The driver writes rate, fields and format only if the unit behaves otherwise. Declination must be zero in the
+    The driver writes rate, fields and format only if the unit's behaviour differs. Declination must be zero in the
     unit, so that its headings refer to magnetic north.
     """
 
@@ -53,7 +53,7 @@ class Os4000Config(Schema):
     silence: Positive = 0.5
     """Timeout without a valid sentence (s), at least five periods; then the session ends."""
     field_strength: Positive | None = None
-    """Magnitude of the magnetic field at the place of calibration (microtesla); None: not checked."""
+    """Magnitude of the magnetic field where the unit was calibrated (microtesla); None: not checked."""
     field_tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.25
     """Tolerance of the field (fraction); beyond it, the heading is marked as disturbed."""
     iron: IronConfig = IronConfig()
@@ -73,5 +73,5 @@ class Os4000Config(Schema):
 
     @property
     def timeout(self) -> float:
-        """Timeout without a valid sentence (s); then the session ends."""
+        """Time without a valid sentence after which the session ends (s)."""
         return max(self.silence, 5 / self.rate)

@@ -16,15 +16,15 @@ from monstertruck_schemas.sensor import Attitude
 class Os4000Driver:
     """Receives the unit's stream; writes a setting only if the unit deviates from the configuration.
 
-    The driver does not search for the baud rate: the port opens at its configured rate, and a unit with another rate
-    yields bytes without a sentence. Stamps are arrival times minus ``config.delay``; the unit has no clock.
+    The driver does not search for the baud rate: the port opens at its configured rate, and a unit at another rate
+    yields bytes without a valid sentence. Stamps are arrival times minus ``config.delay``; the unit has no clock.
 
     Args:
         config: rate, fields and checks.
         port: the compass's port.
         clock: time.
-        out: attitudes, REP 103 signs.
-        events: settings written, rejected sentences.
+        out: attitudes with REP 103 signs.
+        events: written settings and rejected sentences.
         name: service name.
     """
 
@@ -51,10 +51,10 @@ class Os4000Driver:
         """Serve one session.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: silence.
-            ProtocolError: bytes without a valid sentence, or sentences without heading, pitch and roll.
-            WrongDeviceError: the bytes at the start contain no sentence of an OS4000.
+            DeviceLostError: the unit was unplugged.
+            DeviceTimeoutError: the unit is silent.
+            ProtocolError: bytes arrive without a valid sentence, or sentences lack heading, pitch or roll.
+            WrongDeviceError: the first bytes contain no OS4000 sentence.
             PortBusyError: another process holds the port.
         """
         async with await self._port.open() as link:
@@ -87,7 +87,7 @@ class Os4000Driver:
             self._events(Reason.DEVICE_MISMATCH, Severity.WARNING, self.name, f"{text} even after setting it")
 
     def _may_write(self, key: Key) -> bool:
-        """Whether a setting may be written again; marks it as written."""
+        """Whether a setting may still be written; marks the setting as written."""
         now, before = self._clock.now(), self._written.get(key)
         # Minimum interval between two writes of one setting (s): the memory wears, and each write pauses the stream.
         setting_period = 3600.0
@@ -97,7 +97,7 @@ class Os4000Driver:
         return True
 
     def _differences(self, heard: list[tuple[int, Sentence]]) -> dict[Key, tuple[int, str]]:
-        """Settings that differ from the configuration: key to configured value and a text."""
+        """Settings that differ from the configuration: configured value and description by key."""
         config = self._config
         wrong: dict[Key, tuple[int, str]] = {}
         fields = observed_fields(heard)
@@ -129,7 +129,7 @@ class Os4000Driver:
                 limit, heard = self._clock.now() + timeout, stream.bytes_heard
 
     def _publish(self, sentences: list[Sentence]) -> bool:
-        """Publish the usable sentences; space the sentences of one burst by the period."""
+        """Publish the usable sentences; the stamps of sentences that arrive in one burst are spaced by the period."""
         received = self._clock.now()
         newest = received - round(self._config.delay * SECOND)
         usable = False

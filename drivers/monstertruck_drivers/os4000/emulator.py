@@ -1,4 +1,4 @@
-"""Device side of an OS4000, byte for byte."""
+"""Emulated OS4000, byte for byte."""
 
 import asyncio
 import math
@@ -74,21 +74,21 @@ CALIBRATION_KEYS: Final = (Key.CALIBRATE_LEVEL, Key.CALIBRATE_VERTICAL)
 class Os4000Emulator(FaultyDevice):
     """OS4000-T that streams from power-up.
 
-    Faults (``inject``): ``frozen on|off`` (repeats one sentence), ``silent on|off``, ``bad_checksum N``,
-    ``empty_field TAG`` and ``nan_field TAG`` (TAG ``none`` ends it), ``half_sentence``, ``prompt`` (stray text),
-    ``pending [DIGITS]`` (an unfinished command, with DIGITS of its value), ``rate N`` and ``format N``
-    (stored settings changed externally), ``disturbance DEGREES`` (added to the heading), ``drift SHARE`` (of the
-    rate), ``host_baud N`` (the host's rate; if it differs from the unit's rate, both sides see noise).
+    Faults (``inject``): ``frozen on|off`` (repeats one sentence), ``silent on|off``, ``bad_checksum N``, ``empty_field
+    TAG`` and ``nan_field TAG`` (TAG ``none`` ends it), ``half_sentence``, ``prompt`` (stray text), ``pending [DIGITS]``
+    (an unfinished command, with DIGITS of its value), ``rate N`` and ``format N`` (stored settings changed externally),
+    ``disturbance DEGREES`` (added to the heading), ``drift SHARE`` (fraction of the sentence rate), ``host_baud N``
+    (the host's rate; if it differs from the unit's rate, both sides see noise).
 
     Args:
         clock: time.
-        source: physics.
-        seed: seed of the sensors' fine noise and of garbled bytes.
+        source: physics to measure.
+        seed: seed for the sensors' fine noise and for garbled bytes.
         rate: stored rate.
         fields: stored field mask.
-        terminators: bytes the firmware takes as end of value.
-        settle: pause of the stream after a setting (s).
-        pace: pace bytes at the unit's baud rate.
+        terminators: bytes that the firmware accepts as the end of a value.
+        settle: pause in the stream after a setting is written (s).
+        pace: whether to pace bytes at the unit's baud rate.
     """
 
     def __init__(
@@ -152,7 +152,7 @@ class Os4000Emulator(FaultyDevice):
             self._end.baud = self._baud
 
     def power_cycle(self) -> None:
-        """Switch the supply off and on: an open command is dropped, a stored baud rate becomes active."""
+        """Switch the supply off and on: an unfinished command is dropped, and the stored baud rate becomes active."""
         self._boot()
 
     async def run(self, end: DeviceEnd) -> None:
@@ -324,5 +324,5 @@ def _replace_field(line: bytes, tag: str, text: str) -> bytes:
 
 
 def emulated(setup: EmulatorSetup) -> Os4000Emulator:
-    """Create the compass of a simulated truck."""
+    """Create a simulated truck's compass."""
     return Os4000Emulator(setup.clock, setup.physics.compass, seed=setup.seed)

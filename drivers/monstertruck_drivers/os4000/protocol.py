@@ -1,4 +1,4 @@
-"""Sentences and commands of the OS4000: format 1, with tagged fields and an XOR checksum.
+"""OS4000 sentences and commands: format 1, with tagged fields and an XOR checksum.
 
 Source: manufacturer's user guides of the OS4000 and OS5000 series (same command family).
 """
@@ -25,7 +25,7 @@ RATE_MAX: Final = 40
 
 
 class Fields(IntFlag):
-    """Field mask: content of a sentence."""
+    """Field mask: the fields that a sentence contains."""
 
     HEADING = 1
     PITCH = 2
@@ -113,7 +113,7 @@ def parse(line: bytes) -> Sentence:
     """Parse one sentence, with or without its line end.
 
     Raises:
-        ValueError: not a sentence, wrong checksum, unknown or repeated tag; the text names the error.
+        ValueError: not a sentence, wrong checksum, or an unknown or repeated tag; the message names the error.
     """
     frame = _FRAME.fullmatch(line)
     if frame is None:
@@ -162,7 +162,7 @@ def build(sentence: Sentence, *, mask: Fields | None = None) -> bytes:
 
     Args:
         sentence: values; None values are omitted.
-        mask: print only these fields.
+        mask: fields to print; None for all.
     """
     one, two, three = "{}{:.1f}", "{}{:.2f}", "{}{:.3f}"
     columns = (

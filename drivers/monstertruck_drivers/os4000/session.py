@@ -1,4 +1,4 @@
-"""Receives from an OS4000 and sets it up over one open link; shared by the driver and `identify`."""
+"""Receives from an OS4000 and configures it over one open link; shared by the driver and `identify`."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -45,7 +45,7 @@ class Os4000Session:
         return heard
 
     async def start(self, rate: int, may_set: Callable[[Key], bool] = lambda _: True) -> list[tuple[int, Sentence]]:
-        """Make the unit send sentences, from any state it was left in.
+        """Make the unit send sentences, whatever state it was left in.
 
         The unit may stream, wait inside an unfinished command, have its output switched off (a stored setting), or
         print another format. The session writes only to a silent unit or to one that prints another known format. It
@@ -53,15 +53,15 @@ class Os4000Session:
 
         Args:
             rate: sentence rate to set if the output is off (Hz).
-            may_set: called before a setting is written; returns whether it may be.
+            may_set: called before a setting is written; returns whether writing is allowed.
 
         Returns:
-            At least one sentence, with arrival times.
+            At least one sentence, each with its arrival time.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: silence.
-            WrongDeviceError: bytes arrive, but no sentence of an OS4000.
+            DeviceLostError: the unit was unplugged.
+            DeviceTimeoutError: the unit is silent.
+            WrongDeviceError: bytes arrive, but no OS4000 sentence.
         """
         # The content of a half-typed command must not become its value: leave the command before ending anything.
         set_rate = protocol.key(Key.RATE) + protocol.value(rate)
@@ -93,11 +93,11 @@ class Os4000Session:
     async def set(self, command: Key, number: int) -> None:
         """Write one setting and return to streaming.
 
-        Firmware versions may differ in the terminator of a value: this sends a space, then CR, and finally ESC to leave
-        the command.
+        The terminator of a value may depend on the firmware version: the session sends a space, then CR, and finally
+        ESC to leave the command.
 
         Raises:
-            DeviceLostError: unplugged.
+            DeviceLostError: the unit was unplugged.
         """
         self._link.write(protocol.key(command))
         await self.listen(0.3, count=1000)  # seconds to wait for the prompt of a command
@@ -115,7 +115,7 @@ class Os4000Session:
 
 
 def observed_fields(heard: list[tuple[int, Sentence]]) -> Fields:
-    """Return all fields seen; a field may be empty in a single sentence."""
+    """Return all fields received; a field may be empty in individual sentences."""
     mask = Fields(0)
     for _, sentence in heard:
         mask |= sentence.fields
@@ -123,7 +123,7 @@ def observed_fields(heard: list[tuple[int, Sentence]]) -> Fields:
 
 
 def observed_rate(heard: list[tuple[int, Sentence]]) -> float | None:
-    """Return sentences per second from the median interval, robust to a lost sentence or a burst; None: too few."""
+    """Return the sentence rate (Hz) from the median interval, robust to a lost sentence or a burst; None if too few."""
     times = [time for time, _ in heard]
     intervals = sorted(after - before for before, after in pairwise(times))
     if len(intervals) < 2 or intervals[len(intervals) // 2] == 0:
@@ -132,15 +132,15 @@ def observed_rate(heard: list[tuple[int, Sentence]]) -> float | None:
 
 
 async def identify(link: Link, clock: Clock, settings: Os4000Config) -> dict[str, object]:
-    """Receive sentences and request the firmware version; only a silent unit is set to another rate.
+    """Receive sentences and request the firmware version; only a silent unit's rate is changed.
 
     Returns:
-        JSON-able: ``version`` (lines that the unit prints), ``rate`` (Hz), ``fields`` (names), ``sample`` in the
-        device's units and signs.
+        JSON-compatible dict: ``version`` (lines that the unit prints), ``rate`` (Hz), ``fields`` (names), ``sample`` in
+        the device's units and signs.
 
     Raises:
-        DeviceTimeoutError: silence.
-        WrongDeviceError: another device, or a baud rate other than the port's.
+        DeviceTimeoutError: the unit is silent.
+        WrongDeviceError: another device answers, or the unit's baud rate differs from the port's.
     """
     session = Os4000Session(link, clock)
     heard = await session.start(20)  # rate that a unit gets whose output is off

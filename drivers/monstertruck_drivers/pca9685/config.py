@@ -1,4 +1,4 @@
-"""Settings of a PCA9685 with steering servos, and of one with a speed controller as well."""
+"""Settings for a PCA9685 with steering servos, with or without a speed controller."""
 
 from functools import cached_property
 from typing import Annotated, Literal, Self
@@ -40,7 +40,7 @@ class Pca9685Config(Schema):
     """Pulse rate (Hz); analog servos and most speed controllers expect 50. The resolution of a pulse is 1/4096 of the
     cycle"""
     oscillator: Annotated[float, Field(ge=23e6, le=27e6)] = OSCILLATOR
-    """Frequency of this chip's oscillator (Hz): measure the frequency of a pulse and set oscillator = 4096 times that
+    """This chip's oscillator frequency (Hz): measure the frequency of a pulse and set oscillator = 4096 times that
     times (prescaler + 1), which ``probe`` prints. An error of 4 % moves a neutral pulse by 60 us"""
     dead_time: Annotated[float, Field(ge=0, le=1)] | None = None
     """Dead time from a steering command to the first movement of the wheels (s); null if it was not measured"""
@@ -51,11 +51,11 @@ class Pca9685Config(Schema):
     answer_timeout: Annotated[float, Field(gt=0, le=1)] = 0.1
     """Timeout of one transfer on the bus (s)"""
     command_timeout: Annotated[float, Field(gt=0, le=2)] = 0.25
-    """Maximum age of a command (s); then the servos hold and the motor receives its neutral pulse"""
+    """Maximum age of a command (s); after that, the servos hold and the motor receives its neutral pulse"""
 
     @cached_property
     def prescale(self) -> int:
-        """Value of the prescaler."""
+        """Prescaler value."""
         return prescale(self.frequency, self.oscillator)
 
     def counts(self, pulse_us: float) -> int:
@@ -73,13 +73,13 @@ class Pca9685Config(Schema):
 
     @property
     def steering_outputs(self) -> SteeringOutputs:
-        """Steering outputs of the servos."""
+        """Steering outputs driven by the servos."""
         rear = (0.0, 0.0) if self.rear is None else self.rear.reach
         return SteeringOutputs((self.front.reach, rear), self.dead_time, self.lag)
 
     @property
     def battery(self) -> None:
-        """None: the chip measures nothing."""
+        """None, because the chip measures nothing."""
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
@@ -101,21 +101,21 @@ class Pca9685EscConfig(Schema):
 
     @property
     def motor_limits(self) -> MotorLimits:
-        """Limits of the motor."""
+        """Motor limits."""
         return self.esc.motor_limits
 
     @property
     def steering_outputs(self) -> SteeringOutputs:
-        """Steering outputs of the servos."""
+        """Steering outputs driven by the servos."""
         return self.unit.steering_outputs
 
     @property
     def battery(self) -> None:
-        """None: the chip measures nothing."""
+        """None, because the chip measures nothing."""
 
     @property
     def command_timeout(self) -> float:
-        """Maximum age of the latest command (s); then the pulse becomes neutral."""
+        """Age of the latest command at which the pulse becomes neutral (s)."""
         return self.unit.command_timeout
 
     @property

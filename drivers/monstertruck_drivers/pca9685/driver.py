@@ -1,4 +1,4 @@
-"""Steering driver for a PCA9685: pulses out, and the chip's registers read back."""
+"""Steering driver for a PCA9685: sends pulses and reads the chip's registers back."""
 
 import contextlib
 
@@ -18,20 +18,20 @@ from monstertruck_schemas.sensor import Battery, DriveFeedback, SteeringFeedback
 
 
 class Pca9685Driver:
-    """Sends every steering command at once, and reads the registers back in between.
+    """Sends every steering command immediately, and reads the registers back between commands.
 
-    **No watchdog.** The chip repeats the latest pulses until it receives others or loses its supply, even while the
-    computer hangs. When commands are stale, the servos hold. If registers differ from the written values, as after a
-    loss of the chip's supply, the driver writes them again and reports an event.
+    **No watchdog.** The chip repeats the latest pulses until it receives new ones or loses its supply, even while the
+    computer hangs. When commands are stale, the servos hold. If registers differ from the values written, as after the
+    chip has lost its supply, the driver rewrites the registers and reports an event.
 
     Args:
         config: calibration and rates.
         port: the I2C bus.
-        clock: time, also the clock of the commands' stamps.
-        commands: steering commands of the gate.
-        out: feedback: pulses being sent, as servo angles in rad, left positive.
-        battery: not used; the chip measures nothing.
-        events: faults of the chip.
+        clock: time source; commands are stamped with the same clock.
+        commands: steering commands from the gate.
+        out: feedback: current pulses, as servo angles in rad, left positive.
+        battery: not used, because the chip measures nothing.
+        events: chip faults.
         name: service name.
         drive: not used.
     """
@@ -63,13 +63,13 @@ class Pca9685Driver:
         """Serve one session.
 
         Raises:
-            DeviceLostError: no such bus, or it was removed.
-            DeviceTimeoutError: the chip does not acknowledge, three times in a row; at the start: nothing at its
-                address.
-            WrongDeviceError: another device has its address.
+            DeviceLostError: the bus does not exist or was removed.
+            DeviceTimeoutError: three consecutive transfers were not acknowledged, or nothing answers at the chip's
+                address at the start.
+            WrongDeviceError: another device answers at the chip's address.
             PortBusyError: another process holds the emulated bus.
-            DeviceFaultError: a channel that should be at rest reads back another value, twice in a row or while the
-                chip sleeps; all pulses are off.
+            DeviceFaultError: a channel that should be at rest read back another value, twice in a row or while the chip
+                is asleep; all pulses are then off.
         """
         config = self._config
         async with await self._port.open() as link:
@@ -121,12 +121,12 @@ class Pca9685Driver:
         return {servo.channel: self._config.counts(servo.pulse_us(angle)) for servo, angle in pairs}
 
     def _more(self, *, rest: bool = False) -> dict[int, int]:
-        """Counts by channel of other devices on the chip; ``rest`` stops them."""
+        """Counts by channel for other devices on the chip; ``rest`` stops those devices."""
         del rest
         return {}
 
     def _restarted(self) -> None:
-        """Handle a chip that has lost its settings, and with them its pulses."""
+        """Handle a chip that has lost its settings and thus its pulses."""
 
     def _polled(self, stamp: int, received: int) -> None:
         """Publish the feedback of other devices after a poll."""
@@ -149,7 +149,7 @@ class Pca9685Driver:
             raise _unruly(session, unruly)
 
     async def _rest_before_waking(self, session: Pca9685Session) -> None:
-        """Bring the channels of a chip that sleeps to rest, so that each attempt to restart it moves nothing.
+        """Bring the channels of a sleeping chip to rest, so that an attempt to restart it causes no motion.
 
         Raises:
             DeviceFaultError: see ``run``.

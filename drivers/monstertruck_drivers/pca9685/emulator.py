@@ -1,4 +1,4 @@
-"""Device side of a PCA9685, register by register, with the servos and the speed controller on its outputs."""
+"""Emulated PCA9685, register by register, with servos and a speed controller on its outputs."""
 
 import asyncio
 from typing import Final
@@ -41,21 +41,21 @@ _TARGET: Final = "target_{}"
 
 
 class Pca9685Emulator(FaultyDevice):
-    """A PCA9685 that the bus supplies.
+    """A PCA9685 powered from the bus.
 
     Without the auto-increment bit, every byte of a transfer reads or writes the same register. The prescaler can be set
-    only in sleep. Sleep with running outputs sets the restart bit; the outputs then stay off until that bit or their
-    registers are written. Other features of the data sheet: sub-addresses, all-call, reset by general call, both full
-    bits, ``ALL_LED`` registers that read as zero.
+    only in sleep mode. Entering sleep with running outputs sets the restart bit; the outputs then stay off until that
+    bit or their registers are written. Also emulated, according to the data sheet: sub-addresses, all-call, reset by
+    general call, both full bits, ``ALL_LED`` registers that read as zero.
 
     Faults (``inject``): ``brown_out`` (supply off and on), ``absent on|off`` (acknowledges nothing), ``oscillator HZ``.
 
     Args:
         clock: time.
-        servos: physics of the servos; None: the pulses move nothing.
+        servos: servo physics; if None, the pulses have no effect.
         address: address set by its pins.
-        oscillator: frequency of its oscillator (Hz).
-        seed: seed of the signal faults.
+        oscillator: oscillator frequency (Hz).
+        seed: seed for the signal faults.
     """
 
     def __init__(
@@ -133,7 +133,7 @@ class Pca9685Emulator(FaultyDevice):
     # The bus
 
     def transfer(self, address: int, data: bytes, count: int) -> bytes | None:
-        """Answer one transfer; None if not acknowledged."""
+        """Answer one transfer; None if it is not acknowledged."""
         if self.faults["absent"] or not self._powered:
             return None
         if address == GENERAL_CALL:
@@ -202,7 +202,7 @@ class Pca9685Emulator(FaultyDevice):
             self._registers[register] = value
 
     def _order(self, channel: int, values: bytes) -> None:
-        """Handle the stop condition: a pulse takes effect, and runs again after sleep."""
+        """Handle the stop condition: the pulse takes effect and runs again after sleep."""
         start = register_of(channel)
 
         def obey(given: int) -> None:
@@ -250,9 +250,9 @@ class Pca9685EscEmulator(Pca9685Emulator):
     Args:
         clock: time.
         plant: the motor.
-        servos: physics of the servos.
+        servos: servo physics.
         settings: channels and pulses.
-        seed: seed of the signal faults.
+        seed: seed for the signal faults.
     """
 
     def __init__(
@@ -269,14 +269,14 @@ class Pca9685EscEmulator(Pca9685Emulator):
         self._esc = EscEmulator(config.esc, clock, plant, lambda now: self.pulse_us(config.esc.channel, now))
 
     async def run(self, end: DeviceEnd) -> None:
-        """Serve the bus, and run the speed controller on its pulses."""
+        """Serve the bus, and run the speed controller from its pulses."""
         async with asyncio.TaskGroup() as group:
             group.create_task(self._esc.run())
             await super().run(end)
 
 
 def emulated(setup: EmulatorSetup) -> Pca9685Emulator:
-    """Create the servo controller of a simulated robot."""
+    """Create a simulated robot's servo controller."""
     config: Pca9685Config = setup.settings or Pca9685Config()
     return Pca9685Emulator(
         setup.clock,
@@ -288,7 +288,7 @@ def emulated(setup: EmulatorSetup) -> Pca9685Emulator:
 
 
 def emulated_esc(setup: EmulatorSetup) -> Pca9685EscEmulator:
-    """Create the servo and speed controller of a simulated robot."""
+    """Create a simulated robot's servo and speed controller."""
     return Pca9685EscEmulator(
         setup.clock, setup.physics.motors[0], setup.physics.servos, setup.settings, seed=setup.seed
     )

@@ -1,9 +1,9 @@
-"""Driver of a PCA9685 with a speed controller (ESC) on one of its channels: drives and steers.
+"""Driver for a PCA9685 with a speed controller (ESC) on one of its channels: drives and steers.
 
-The pulse follows every command that the gate sends to the servos, so a stop waits for the next tick. The pulse becomes
-neutral when commands are stale and at the start and end of a session. The chip has no watchdog: while the computer
-hangs, it repeats the latest pulse. The motor is not measured: the reported rate is the commanded rate, delayed as
-configured.
+The pulse follows every command that the gate sends to the servos, so a stop waits until the next tick. The pulse
+becomes neutral when commands are stale and at the start and end of a session. The chip has no watchdog: while the
+computer hangs, it repeats the latest pulse. The motor is not measured: the reported rate is the commanded rate, delayed
+as configured.
 """
 
 from typing import Unpack
@@ -21,18 +21,18 @@ from monstertruck_schemas.sensor import Battery, DriveFeedback, SteeringFeedback
 
 
 class Pca9685EscDriver(Pca9685Driver):
-    """Sends the speed controller's pulse along with the servos'.
+    """Sends the speed controller's pulse along with the servo pulses.
 
     Args:
-        config: speed controller and chip.
+        config: speed controller and chip settings.
         port: the I2C bus.
         clock: time.
         steering_commands: ``cmd/steering``.
         drive: not used.
-        steering: pulses being sent, as servo angles.
+        steering: current pulses, as servo angles.
         battery: not used.
-        events: faults of the chip.
-        name: name of the service.
+        events: chip faults.
+        name: service name.
         ends: topics of the shafts; there is one motor, whose rate is published as commanded.
     """
 
@@ -57,7 +57,7 @@ class Pca9685EscDriver(Pca9685Driver):
         self._motor = UnmeasuredMotor(config.esc, clock, ends["commands"], ends["out"], config.command_timeout)
 
     async def run(self, ready: Ready) -> None:
-        """Serve one session; raises the errors of ``Pca9685Driver.run``."""
+        """Serve one session. Raises the same errors as ``Pca9685Driver.run``."""
         self._motor.begin()
         await super().run(ready)
 

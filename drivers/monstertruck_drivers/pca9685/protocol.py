@@ -1,8 +1,8 @@
-"""Registers of the PCA9685, and the arithmetic of its pulses.
+"""PCA9685 registers and pulse arithmetic.
 
 Source: NXP, PCA9685 product data sheet: addresses, register definitions (table 3), restart, prescaler, software reset.
-It gives the oscillator's frequency as typical, without a tolerance; makers of boards report 23 to 27 MHz (Adafruit PWM
-servo driver library).
+The data sheet gives only a typical oscillator frequency, without a tolerance; board makers report 23 to 27 MHz
+(Adafruit PWM servo driver library).
 """
 
 from enum import IntEnum, IntFlag
@@ -95,10 +95,10 @@ def register_of(channel: int) -> int:
 
 
 def pulse(channel: int, counts: int) -> bytes:
-    """Return register and values of a pulse from the start of the cycle; 0 counts mean no pulse.
+    """Return the register and values for a pulse that starts with the cycle; 0 counts mean no pulse.
 
     Raises:
-        ValueError: longer than a cycle.
+        ValueError: the pulse is longer than a cycle.
     """
     if not 0 <= counts < COUNTS:
         raise ValueError(f"{counts} counts do not fit a cycle of {COUNTS}")
@@ -107,7 +107,7 @@ def pulse(channel: int, counts: int) -> bytes:
 
 
 def counts_of(values: bytes) -> int:
-    """Return the pulse length in counts from a channel's four registers; 0 = none."""
+    """Return the pulse length in counts from a channel's four registers; 0 means no pulse."""
     on, off = int.from_bytes(values[:2], "little"), int.from_bytes(values[2:4], "little")
     if off & FULL << 8:
         return 0

@@ -1,4 +1,4 @@
-"""Registers of one PCA9685 on an open bus; shared by the driver and `identify`."""
+"""Access to the registers of one PCA9685 on an open bus; shared by the driver and `identify`."""
 
 from monstertruck_drivers.i2c.host import I2cBus
 from monstertruck_drivers.link import Link
@@ -28,8 +28,8 @@ class Pca9685Session:
     Args:
         link: open link to the bus.
         clock: time.
-        address: address of the chip.
-        timeout: timeout of one transfer (s).
+        address: the chip's address.
+        timeout: timeout for one transfer (s).
     """
 
     def __init__(self, link: Link, clock: Clock, address: int, timeout: float) -> None:
@@ -56,22 +56,22 @@ class Pca9685Session:
         self._bus.send(self._address, data)
 
     async def read(self, register: int) -> int:
-        """Read a register, whether or not the chip increments; raises the errors of ``write``."""
+        """Read a register, whether or not auto-increment is on; raises the same errors as ``write``."""
         return (await self._bus.transfer(self._address, bytes((register,)), 1))[0]
 
     async def counts(self, channel: int) -> int:
-        """Read the length of a channel's pulse, in counts; raises the errors of ``write``."""
+        """Read a channel's pulse length in counts; raises the same errors as ``write``."""
         return counts_of(await self._bus.transfer(self._address, bytes((register_of(channel),)), 4))
 
     async def identify(self) -> tuple[PwmMode1, int]:
-        """Make sure that a PCA9685 answers, without writing to it.
+        """Verify that a PCA9685 answers, without writing to it.
 
         Returns:
             ``MODE1`` and the prescaler.
 
         Raises:
             DeviceLostError: the bus is gone.
-            DeviceTimeoutError: nothing at this address.
+            DeviceTimeoutError: nothing answers at this address.
             WrongDeviceError: the device lacks the sub-addresses of a PCA9685.
         """
         found = bytes([await self.read(PwmRegister.SUBADR1 + i) for i in range(len(OWN_ADDRESSES))])
@@ -82,17 +82,17 @@ class Pca9685Session:
         return PwmMode1(await self.read(PwmRegister.MODE1)), await self.read(PwmRegister.PRE_SCALE)
 
     async def asleep(self) -> bool:
-        """Whether the oscillator stands; raises as ``identify``."""
+        """Whether the oscillator is off; raises the same errors as ``identify``."""
         mode, _ = await self.identify()
         return bool(mode & PwmMode1.SLEEP)
 
     async def set_up(self, prescaler: int) -> None:
-        """Run the outputs at the configured frequency; pulses that already run at it are not interrupted.
+        """Run the outputs at the configured frequency; pulses already running at that frequency are not interrupted.
 
         Raises:
             DeviceLostError: the bus is gone.
-            DeviceTimeoutError: nothing at this address.
-            WrongDeviceError: not a PCA9685.
+            DeviceTimeoutError: nothing answers at this address.
+            WrongDeviceError: the device is not a PCA9685.
         """
         mode, present = await self.identify()
         if present != prescaler:
@@ -104,25 +104,25 @@ class Pca9685Session:
             await self._clock.sleep(WAKE_UP)
 
     async def sleep(self) -> None:
-        """Stop the oscillator, and with it all pulses; raises the errors of ``write``."""
+        """Stop the oscillator and thus all pulses; raises the same errors as ``write``."""
         await self.write(bytes((PwmRegister.MODE1, AWAKE | PwmMode1.SLEEP)))
 
     async def is_set_up(self, prescaler: int) -> bool:
-        """Whether mode and frequency are those of ``set_up``; raises the errors of ``write``."""
+        """Whether mode and frequency match ``set_up``; raises the same errors as ``write``."""
         registers = PwmRegister.MODE1, PwmRegister.MODE2, PwmRegister.PRE_SCALE
         return [await self.read(register) for register in registers] == [AWAKE, MODE2_RESET, prescaler]
 
 
 async def identify(link: Link, clock: Clock, settings: Pca9685Config | Pca9685EscConfig) -> dict[str, object]:
-    """Read the registers without writing.
+    """Read the registers without writing to the chip.
 
     Returns:
-        JSON-able: ``address``, ``asleep``, ``prescaler``, ``frequency_hz`` for the configured oscillator, ``channels``:
-        pulse by channel in microseconds (0 = off).
+        JSON-compatible dict: ``address``, ``asleep``, ``prescaler``, ``frequency_hz`` for the configured oscillator,
+        and ``channels``, the pulse in microseconds by channel (0: off).
 
     Raises:
-        DeviceTimeoutError: nothing at this address.
-        WrongDeviceError: another device.
+        DeviceTimeoutError: nothing answers at this address.
+        WrongDeviceError: another device answers.
     """
     config = settings.unit if isinstance(settings, Pca9685EscConfig) else settings
     session = Pca9685Session(link, clock, config.address, config.answer_timeout)

@@ -1,1 +1,1 @@
-"""Receivers of radio controls, for the operator next to the robot."""
+"""Radio-control receivers, for an operator next to the robot."""

@@ -1,4 +1,4 @@
-"""Receiver settings: meaning of the channels."""
+"""Receiver settings: the meaning of each channel."""
 
 from typing import Annotated, Literal, Self
 
@@ -11,7 +11,7 @@ Channel = Annotated[int, Field(ge=1, le=RADIO_CHANNELS)]
 
 
 class ReceiverConfig(Schema):
-    """Channels of the radio control, numbered as on the transmitter."""
+    """Radio-control channels, numbered as on the transmitter."""
 
     speed: Channel = 2
     """Speed stick"""
@@ -30,7 +30,7 @@ class ReceiverConfig(Schema):
     dead_band: Annotated[float, Field(ge=0, le=0.3)] = 0.05
     """Dead band around a stick's centre, as a fraction of its travel"""
     settle: Annotated[int, Field(ge=1, le=20)] = 3
-    """Consecutive frames with a switch on before it takes effect; off takes effect at once"""
+    """Consecutive frames with a switch on before it takes effect; off takes effect immediately"""
     silence: Annotated[float, Field(gt=0, le=2)] = 0.2
     """Timeout without channels (s); then the transmitter counts as lost"""
 

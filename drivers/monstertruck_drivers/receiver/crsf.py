@@ -1,9 +1,10 @@
-"""CRSF frames of a receiver (TBS Crossfire, ExpressLRS).
+"""CRSF frames from a receiver (TBS Crossfire, ExpressLRS).
 
-Source: TBS, "CRSF protocol" (github.com/tbs-fpv/tbs-crsf-spec). A frame is an address (C8), the length of the rest,
-a type, the payload, and a CRC-8 (polynomial D5, start 0) of type and payload; 64 bytes at most. Type 16 carries the
-channels, type 14 the quality of the radio link: signal of two antennas (dBm without its sign), fraction of packets
-received (%), and more. Without its transmitter an ExpressLRS receiver sends no channels, and a link quality of 0.
+Source: TBS, "CRSF protocol" (github.com/tbs-fpv/tbs-crsf-spec). A frame consists of an address (C8), the length of the
+rest, a type, the payload, and a CRC-8 (polynomial D5, start 0) of type and payload; 64 bytes at most. Type 16 carries
+the channels, type 14 the quality of the radio link: signal at two antennas (dBm without its sign), fraction of packets
+received (%), and more. Without its transmitter, an ExpressLRS receiver sends no channels and reports a link quality of
+0.
 """
 
 from typing import Final
@@ -31,7 +32,7 @@ _TABLE: Final = tuple(_crc_of(byte) for byte in range(256))
 
 
 def crc8(data: bytes) -> int:
-    """Return the CRC of type and payload."""
+    """Return the CRC of a frame's type and payload."""
     crc = 0
     for byte in data:
         crc = _TABLE[crc ^ byte]
@@ -56,7 +57,7 @@ def link_frame(quality: float, rssi: float) -> bytes:
 
 
 class CrsfParser:
-    """Extracts messages from bytes; skips frames of other types."""
+    """Extracts messages from a byte stream; skips frames of other types."""
 
     def __init__(self) -> None:
         self.refused = 0

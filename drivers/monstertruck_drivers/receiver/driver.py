@@ -1,4 +1,4 @@
-"""Receiver driver: converts channels into the requests of the operator next to the robot."""
+"""Receiver driver: converts channels into requests from the operator next to the robot."""
 
 from collections import deque
 from typing import Final
@@ -22,12 +22,12 @@ PERIOD: Final = SECOND // 50
 
 
 def parser_of(config: ReceiverConfig) -> ReceiverParser:
-    """Return the parser of a receiver's protocol."""
+    """Return the parser for the receiver's protocol."""
     return CrsfParser() if isinstance(config, CrsfConfig) else SbusParser()
 
 
 class Hand:
-    """State of the radio control, accumulated from frames. Pure.
+    """State of the radio control, accumulated from frames; performs no I/O.
 
     Args:
         config: meaning of the channels.
@@ -106,11 +106,11 @@ class ReceiverDriver:
 
     Args:
         config: protocol and channels.
-        port: port of the receiver.
+        port: the receiver's port.
         clock: time.
-        out: the operator's requests, at 50 Hz, also while the transmitter is lost.
+        out: the operator's requests, sent at 50 Hz even while the transmitter is lost.
         events: loss and return of the transmitter.
-        name: name of the service.
+        name: service name.
     """
 
     def __init__(
@@ -135,10 +135,10 @@ class ReceiverDriver:
         """Serve one session.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: silence.
-            ProtocolError: bytes without a frame.
-            WrongDeviceError: bytes arrive at the start, but no frame.
+            DeviceLostError: the receiver was unplugged.
+            DeviceTimeoutError: the receiver is silent.
+            ProtocolError: bytes arrive without a valid frame.
+            WrongDeviceError: the first bytes contain no frame.
             PortBusyError: another process holds the port.
         """
         async with await self._port.open() as link:
@@ -160,7 +160,7 @@ class ReceiverDriver:
                         raise
 
     def _publish(self, hand: Hand, newest: HandControls | None) -> HandControls:
-        """Publish when due, or when a switch or the link has changed; return the latest message."""
+        """Publish when a message is due or a switch or the link has changed; return the latest message."""
         now = self._clock.now()
         controls = hand.controls(now, self._out.next_seq(), self.name)
         if newest is not None and now - newest.received < PERIOD and controls.switches == newest.switches:
@@ -177,7 +177,7 @@ class ReceiverDriver:
 
 
 async def first_frames(stream: DeviceStream[ReceiverFrame], config: ReceiverConfig) -> list[ReceiverFrame]:
-    """Wait for the first frames of a session; raises the errors of ``DeviceStream.first``."""
+    """Wait for the first frames of a session. Raises the same errors as ``DeviceStream.first``."""
     # Seconds to receive a frame at the start; a receiver without its transmitter sends link statistics only.
     listen = 1.0
     hint = "another protocol or baud rate" if isinstance(config, CrsfConfig) else "is the signal inverted?"
@@ -188,10 +188,11 @@ async def identify(link: Link, clock: Clock, settings: ReceiverConfig) -> dict[s
     """Listen for half a second.
 
     Returns:
-        JSON-able: ``channels`` -1 to 1 (None without a transmitter), ``failsafe``, ``link_quality``, ``rssi_dbm``.
+        JSON-compatible dict: ``channels`` from -1 to 1 (None without a transmitter), ``failsafe``, ``link_quality``,
+        ``rssi_dbm``.
 
     Raises:
-        DeviceError: see the driver's ``run``.
+        DeviceError: the same errors as from the driver's ``run``.
     """
     look = 0.5  # duration of the frame collection (s)
     stream = DeviceStream(link, clock, parser_of(settings).feed)

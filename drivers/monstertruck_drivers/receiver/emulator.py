@@ -1,7 +1,8 @@
-"""Device side of receivers, byte for byte, with their transmitter and its operator.
+"""Emulated receivers, byte for byte, with their transmitter and operator.
 
-Real receivers stream without a request. Without its transmitter, a CRSF receiver sends no channels and a link quality
-of 0; an SBUS receiver repeats its latest channels, reports lost packets for a while, then the loss of its transmitter.
+Real receivers stream without a request. Without its transmitter, a CRSF receiver sends no channels and reports a link
+quality of 0; an SBUS receiver repeats its latest channels and reports lost packets for a while, and then the loss of
+its transmitter.
 """
 
 from typing import Final
@@ -22,7 +23,7 @@ FAILSAFE_AFTER: Final = SECOND
 
 
 class ReceiverEmulator(FaultyDevice):
-    """A receiver and its transmitter: sticks in the middle, switches off.
+    """A receiver and its transmitter, initially with centred sticks and all switches off.
 
     Faults (``inject``): ``move CHANNEL POSITION`` (by the operator), ``transmitter on|off``, ``quality SHARE``,
     ``silent on|off``, ``damage N`` (the next N frames have a wrong byte).
@@ -30,7 +31,7 @@ class ReceiverEmulator(FaultyDevice):
     Args:
         clock: time.
         settings: selects the protocol.
-        seed: seed of the packet loss.
+        seed: seed for the packet loss.
     """
 
     def __init__(self, clock: Clock, settings: ReceiverConfig | None = None, *, seed: int = 0) -> None:
@@ -59,11 +60,11 @@ class ReceiverEmulator(FaultyDevice):
         self._sent = tuple(self._positions)
 
     def move(self, channel: int, position: float) -> None:
-        """Move a stick or switch, -1 to 1."""
+        """Move a stick or switch to a position from -1 to 1."""
         self._positions[channel - 1] = raw(position)
 
     def power_cycle(self) -> None:
-        """Switch the supply off and on: the receiver finds its transmitter again if that is on."""
+        """Switch the supply off and on: the receiver finds its transmitter again if the transmitter is on."""
 
     def _set_transmitter(self, on: bool) -> None:
         self._transmitter, self._lost_at = on, self._clock.now()
@@ -106,10 +107,10 @@ class ReceiverEmulator(FaultyDevice):
 
 
 def emulated(setup: EmulatorSetup) -> ReceiverEmulator:
-    """Create the CRSF receiver of a simulated robot."""
+    """Create a simulated robot's CRSF receiver."""
     return ReceiverEmulator(setup.clock, setup.settings, seed=setup.seed)
 
 
 def emulated_sbus(setup: EmulatorSetup) -> ReceiverEmulator:
-    """Create the SBUS receiver of a simulated robot."""
+    """Create a simulated robot's SBUS receiver."""
     return ReceiverEmulator(setup.clock, setup.settings or SbusConfig(), seed=setup.seed)

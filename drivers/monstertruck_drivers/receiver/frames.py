@@ -6,7 +6,7 @@ from monstertruck_drivers.receiver.protocol import ChannelWords
 
 
 class ReceiverFrame(NamedTuple):
-    """One message of a receiver; fields it does not carry are None."""
+    """One message from a receiver; fields that it does not contain are None."""
 
     channels: ChannelWords | None = None
     quality: float | None = None
@@ -20,7 +20,7 @@ class ReceiverFrame(NamedTuple):
 
 
 class ReceiverParser(Protocol):
-    """Extracts the messages from a receiver's bytes."""
+    """Extracts messages from a receiver's byte stream."""
 
     refused: int
     """Number of bytes outside of messages."""

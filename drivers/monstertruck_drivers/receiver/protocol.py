@@ -1,7 +1,7 @@
-"""Sixteen channels of 11 bits, shared by CRSF and SBUS receivers, and the constants of both frames.
+"""Sixteen 11-bit channels, shared by CRSF and SBUS receivers, and the constants of both frames.
 
-Source: TBS, "CRSF protocol" (frame 0x16): channels follow each other, the lowest bit first; 172, 992 and 1811 are the
-pulses 988, 1500 and 2012 us. SBUS packs its channels the same way.
+Source: TBS, "CRSF protocol" (frame 0x16): channels are packed back to back, least significant bit first; 172, 992 and
+1811 correspond to pulses of 988, 1500 and 2012 us. SBUS packs its channels the same way.
 """
 
 from typing import Final

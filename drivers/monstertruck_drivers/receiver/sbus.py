@@ -1,8 +1,8 @@
-"""SBUS frames of a receiver (Futaba and others); source: the decoder of PX4 (``src/lib/rc/sbus.cpp``).
+"""SBUS frames from a receiver (Futaba and others); source: the PX4 decoder (``src/lib/rc/sbus.cpp``).
 
-100000 baud, 8 data bits, even parity, 2 stop bits, the line inverted: an adapter or a transistor must invert it back.
-A frame has 25 bytes, every 7 or 14 ms: 0F, the channels, flags, and 00 (or 04, 14, 24, 34 of SBUS 2). Flag 4 marks
-a lost radio packet, flag 8 the loss of the transmitter. There is no checksum, so a wrong bit is a wrong position: after
+100000 baud, 8 data bits, even parity, 2 stop bits, inverted line: an adapter or a transistor must invert it back. A
+25-byte frame arrives every 7 or 14 ms: 0F, the channels, flags, and 00 (or 04, 14, 24, 34 in SBUS 2). Flag 4 marks a
+lost radio packet, flag 8 the loss of the transmitter. There is no checksum, so a wrong bit is a wrong position: after
 damage, a frame is accepted only if the next frame begins where it ends.
 """
 
@@ -30,7 +30,7 @@ def frame(channels: ChannelWords, *, lost: bool = False, failsafe: bool = False)
 
 
 class SbusParser:
-    """Extracts messages from bytes."""
+    """Extracts messages from a byte stream."""
 
     def __init__(self) -> None:
         self.refused = 0

@@ -1,1 +1,1 @@
-"""Basicmicro RoboClaw, used as a counter of two quadrature encoders."""
+"""Basicmicro RoboClaw, used as a counter for two quadrature encoders."""

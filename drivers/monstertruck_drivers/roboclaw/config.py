@@ -1,4 +1,4 @@
-"""Settings of a RoboClaw used as encoder counter."""
+"""Settings for a RoboClaw used as an encoder counter."""
 
 import math
 from typing import Annotated, Literal
@@ -18,7 +18,7 @@ class RoboclawConfig(Schema):
     counts_per_turn: Annotated[int, Field(ge=8, le=1_000_000)] = 4096
     """Counts (edges of both channels) per turn of the WHEEL"""
     left: Literal[1, 2] = 1
-    """Encoder input of the left wheel; the right wheel has the other input"""
+    """Encoder input of the left wheel; the right wheel uses the other input"""
     left_inverted: bool = False
     """Whether the left encoder counts down when the robot drives forward"""
     right_inverted: bool = False
@@ -32,5 +32,5 @@ class RoboclawConfig(Schema):
 
     @property
     def count(self) -> float:
-        """Angle of one count (rad)."""
+        """Wheel angle per count (rad)."""
         return math.tau / self.counts_per_turn

@@ -1,4 +1,4 @@
-"""Encoder service: publishes the counters of two wheels as ``sensor/encoders``."""
+"""Encoder service: publishes the encoder counts of two wheels as ``sensor/encoders``."""
 
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.roboclaw.config import RoboclawConfig
@@ -18,11 +18,11 @@ class RoboclawDriver:
 
     Args:
         config: see ``RoboclawConfig``.
-        port: port of the controller.
+        port: the controller's port.
         clock: time.
-        out: angles of the wheels.
-        events: identity and restarts of the unit.
-        name: name of the service.
+        out: wheel angles.
+        events: the unit's identity and restarts.
+        name: service name.
     """
 
     def __init__(
@@ -47,8 +47,8 @@ class RoboclawDriver:
         """Serve one session.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceRestartedError: the unit has restarted and counts from 0.
+            DeviceLostError: the unit was unplugged.
+            DeviceRestartedError: the unit restarted and is counting from 0.
             DeviceTimeoutError, ProtocolError: no usable answers.
             WrongDeviceError: another device answers.
             PortBusyError: another process holds the port.
@@ -76,10 +76,10 @@ class RoboclawDriver:
                 self._publish(stamp)
 
     def _count(self, before: tuple[int, int], now: tuple[int, int], dt: float) -> None:
-        """Accumulate the counts of ``dt`` seconds.
+        """Accumulate the counts from ``dt`` seconds.
 
         Raises:
-            DeviceRestartedError: more counts than the wheels can turn in that time.
+            DeviceRestartedError: the change exceeds what the wheels can turn in that time.
         """
         steps = [step(old, new) for old, new in zip(before, now, strict=True)]
         if max(map(abs, steps)) * self._config.count > self._config.max_rate * dt:

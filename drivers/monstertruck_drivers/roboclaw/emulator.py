@@ -1,8 +1,7 @@
-"""Device side of a RoboClaw with two encoders, byte for byte.
+"""Emulated RoboClaw with two encoders, byte for byte.
 
-Behaviour of the real unit: it sends only answers, and ignores requests to another address. It drops an incomplete
-request after 10 ms and counts from 0 after every power-up. An encoder that is not wired counts nothing, without an
-error.
+Like the real unit, it only answers requests and ignores those to another address. It drops an incomplete request after
+10 ms and counts from 0 after every power-up. An unwired encoder counts nothing and causes no error.
 """
 
 from functools import partial
@@ -25,16 +24,16 @@ THINKING: Final = MILLISECOND
 
 
 class RoboclawEmulator(FaultyDevice):
-    """Unit with its encoders wired according to the settings.
+    """Unit whose encoders are wired according to the settings.
 
     Faults (``inject``): ``stuck left|right on|off`` (an encoder's disc slips on its shaft), ``mirrored left|right
-    on|off`` (its channels are swapped: it counts backwards), ``silent on|off`` (no answers), ``noise
-    COUNT`` (COUNT answers have a wrong byte), ``reset`` (the supply drops: counters at 0).
+    on|off`` (its channels are swapped: it counts backwards), ``silent on|off`` (no answers), ``noise COUNT`` (COUNT
+    answers contain a wrong byte), ``reset`` (the supply drops: counters restart at 0).
 
     Args:
         clock: time.
-        source: source of the wheels' angles.
-        settings: address, counts per turn, assignment of the inputs.
+        source: source of the wheel angles.
+        settings: address, counts per turn and input assignment.
     """
 
     def __init__(self, clock: Clock, source: WheelSource, settings: RoboclawConfig | None = None) -> None:
@@ -63,7 +62,7 @@ class RoboclawEmulator(FaultyDevice):
         """Counts of the left and right wheel since power-up."""
 
     def power_cycle(self) -> None:
-        """Switch the supply off and on: counters at 0."""
+        """Switch the supply off and on: the counters restart at 0."""
         self._look()
         self._counted = [0.0, 0.0]
 
@@ -118,5 +117,5 @@ class RoboclawEmulator(FaultyDevice):
 
 
 def emulated(setup: EmulatorSetup) -> RoboclawEmulator:
-    """Create the encoders of a simulated robot's rear wheels."""
+    """Create the encoders for a simulated robot's rear wheels."""
     return RoboclawEmulator(setup.clock, setup.physics.wheels, setup.settings)

@@ -1,8 +1,8 @@
-"""Packet serial of the RoboClaw (Basicmicro, "RoboClaw Series User Manual", chapters "Packet Serial", "Encoders").
+"""RoboClaw packet serial protocol (Basicmicro, "RoboClaw Series User Manual", chapters "Packet Serial", "Encoders").
 
-A request is the unit's address, a command and its arguments. An answer is the data and a CRC of two bytes, high byte
-first, over the request's address and command and the data: CRC-16 with polynomial 0x1021, initial value 0. The unit
-drops a request that pauses for more than 10 ms.
+A request consists of the unit's address, a command and its arguments. An answer consists of data and a two-byte CRC,
+high byte first, over the request's address and command and the data: CRC-16 with polynomial 0x1021, initial value 0.
+The unit drops a request that contains a pause of more than 10 ms.
 """
 
 import binascii
@@ -24,7 +24,7 @@ COUNTS_SIZE: Final = _COUNTS.size + _CRC.size
 
 
 class RoboclawCommand(IntEnum):
-    """Requests used; none of them moves a motor or changes a setting."""
+    """Requests that the driver uses; none of them moves a motor or changes a setting."""
 
     VERSION = 21
     """Answer: a text that ends with a line feed and 0."""

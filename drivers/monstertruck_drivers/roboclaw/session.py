@@ -1,4 +1,4 @@
-"""Requests and answers of one RoboClaw; shared by the driver and `identify`."""
+"""Requests to one RoboClaw and its answers; shared by the driver and `identify`."""
 
 from monstertruck_drivers.link import Link
 from monstertruck_drivers.roboclaw.config import RoboclawConfig
@@ -22,8 +22,8 @@ class RoboclawSession:
     Args:
         link: open link.
         clock: time.
-        address: address of the unit.
-        timeout: timeout of an answer (s).
+        address: the unit's address.
+        timeout: maximum time to wait for an answer (s).
     """
 
     def __init__(self, link: Link, clock: Clock, address: int, timeout: float) -> None:
@@ -36,8 +36,8 @@ class RoboclawSession:
         """Return the unit's version text.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: silence.
+            DeviceLostError: the unit was unplugged.
+            DeviceTimeoutError: the unit does not answer.
             WrongDeviceError: another device answers.
         """
         heard = b""
@@ -57,8 +57,8 @@ class RoboclawSession:
         """Read both counters.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: no answer in time.
+            DeviceLostError: the unit was unplugged.
+            DeviceTimeoutError: the answer did not arrive in time.
             ProtocolError: the answer is damaged.
         """
         asked = request(self._address, RoboclawCommand.COUNTS)
@@ -89,10 +89,10 @@ async def identify(link: Link, clock: Clock, settings: RoboclawConfig) -> dict[s
     """Read the version and both counters.
 
     Returns:
-        JSON-able: ``version``, ``counts`` of inputs 1 and 2.
+        JSON-compatible dict: ``version`` and ``counts`` (inputs 1 and 2).
 
     Raises:
-        DeviceError: see the driver's ``run``.
+        DeviceError: the same errors as from the driver's ``run``.
     """
     session = RoboclawSession(link, clock, settings.address, settings.answer_timeout)
     return {"version": await session.identify(), "counts": list(await session.counts())}

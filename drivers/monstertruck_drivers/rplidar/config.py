@@ -1,4 +1,4 @@
-"""Settings of the RPLIDARs."""
+"""Settings for RPLIDARs."""
 
 from typing import Annotated, Literal
 

@@ -1,4 +1,4 @@
-"""Driver of the RPLIDARs: starts the motor and the scan, and publishes every revolution."""
+"""RPLIDAR driver: starts the motor and the scan, and publishes every revolution."""
 
 from typing import Final
 
@@ -34,11 +34,11 @@ STANDS: Final = ": its motor does not turn (an A1 needs port.dtr false)"
 
 
 class SampleDecoder:
-    """Decodes the bytes of a stream into samples, each with its measurement time assuming immediate arrival.
+    """Decodes a byte stream into samples, with measurement times that assume immediate arrival.
 
     Args:
         mode: scan mode.
-        baud: baud rate of the line; None if it has none.
+        baud: baud rate; None if the line has none.
     """
 
     def __init__(self, mode: ScanMode, baud: int | None) -> None:
@@ -51,7 +51,7 @@ class SampleDecoder:
         self._odd: list[float] = []
 
     def feed(self, data: bytes, arrival: float) -> list[BeamSamples]:
-        """Return the samples of the completed records; ``arrival`` is the arrival time of the bytes (ns)."""
+        """Return the samples from the completed records; ``arrival`` is the arrival time of the bytes (ns)."""
         records = self.parser.feed(data)
         if self._mode.answer is DataType.STANDARD:
             return [self._timed(decode_standard(record.data), arrival) for record in records]
@@ -88,18 +88,18 @@ class SampleDecoder:
 
 
 class RplidarDriver(ScannerDriver[RplidarConfig]):
-    """A RPLIDAR on a port."""
+    """Driver for an RPLIDAR on a port."""
 
     async def run(self, ready: Ready) -> None:
-        """Serve one session: identify the unit, check its health, run motor and scan; both are off at its end.
+        """Serve one session: identify the unit, check its health, and scan. Motor and scan are off when it ends.
 
         Raises:
-            DeviceFaultError: the unit stays in its protection stop after a reset.
-            DeviceLostError: nothing plugged in, or unplugged.
-            DeviceTimeoutError: silence, or a stationary head.
+            DeviceFaultError: the unit remains in protection stop after a reset.
+            DeviceLostError: no unit is plugged in, or it was unplugged.
+            DeviceTimeoutError: the unit is silent, or its head does not turn.
             PortBusyError: another process holds the port.
-            ProtocolError: answers that violate the protocol, or bytes without a sample.
-            WrongDeviceError: another device, or another unit than configured.
+            ProtocolError: answers violate the protocol, or bytes arrive without a valid sample.
+            WrongDeviceError: another device answers, or another unit than the configured one.
         """
         async with await self._port.open() as link:
             session = RplidarSession(link, self._clock, self._config)

@@ -1,4 +1,4 @@
-"""Device side of the RPLIDARs, byte for byte: start-up, health, modes, spin-up of the motor, streams."""
+"""Emulated RPLIDARs, byte for byte: start-up, health, modes, motor spin-up and streams."""
 
 import asyncio
 import struct
@@ -49,14 +49,14 @@ class RplidarEmulator(FaultyDevice):
 
     Faults (``inject``): ``silent on|off`` and ``deaf on|off``, ``health 0|1|2 CODE`` (2: protection stop until a
     reset), ``broken on|off`` (protection stop also after a reset), ``bad_checksum N`` (the next N records), ``torn``
-    (the next record begins in its middle), and the faults of the head.
+    (the next record begins in its middle), and the head's faults.
 
     Args:
         clock: time.
-        source: source of the ranges.
-        model: model according to its data sheet.
-        seed: seed of covers.
-        firmware: version; below 1.24 the unit does not list its modes.
+        source: range source.
+        model: the model's data sheet.
+        seed: seed for covers.
+        firmware: firmware version; below 1.24, the unit does not list its modes.
         serial: 32 hexadecimal digits.
     """
 
@@ -118,7 +118,7 @@ class RplidarEmulator(FaultyDevice):
                     self._answer(end, *taken)
 
     def power_cycle(self) -> None:
-        """Switch the supply off and on: idle; a motor driven by the adapter board stops, any other one turns."""
+        """Switch the supply off and on: the unit is idle; a motor on the adapter board stops, any other turns."""
         self.head.stop()
         self._restart()
         self._motor_off = self._model.adapter
@@ -144,7 +144,7 @@ class RplidarEmulator(FaultyDevice):
     # Requests
 
     def _request(self) -> tuple[int, bytes] | None:
-        """Return the next request as command and payload; drop bytes that form no request."""
+        """Return the next request as command and payload; drop bytes that do not form a request."""
         while self._input:
             data = self._input
             if data[0] != SYNC:
@@ -299,7 +299,7 @@ def _first_capsules(modes: tuple[ScanMode, ...]) -> ScanMode:
 
 
 def emulated(setup: EmulatorSetup) -> RplidarEmulator:
-    """Create the lidar of a simulated robot."""
+    """Create a simulated robot's lidar."""
     settings = setup.settings if isinstance(setup.settings, RplidarConfig) else RplidarConfig()
     serial = settings.serial_number or "7DED9A87C5E392D3A5E49EF0ED383D65"
     return RplidarEmulator(setup.clock, setup.room, MODELS[settings.model], seed=setup.seed, serial=serial)

@@ -1,17 +1,16 @@
-"""Requests, answers and samples of the RPLIDARs (SLAMTEC, "RPLIDAR interface protocol and application notes" 2.8).
+"""RPLIDAR requests, answers and samples (SLAMTEC, "RPLIDAR interface protocol and application notes" 2.8).
 
-A request is 0xA5, command, and for commands with a payload its length, the payload, and the exclusive or of all bytes
-before. An answer begins with a descriptor: A5 5A, 30 bits of length and 2 of mode (1 = repeated), type of data. Samples
-come in one of four forms:
+A request consists of 0xA5, the command, and, for commands with a payload, its length, the payload, and the exclusive or
+of all preceding bytes. An answer begins with a descriptor: A5 5A, 30 bits of length and 2 of mode (1 = repeated), type
+of data. Samples come in one of four forms:
 
 - standard (0x81): one sample in five bytes, checked by three bits only;
 - express (0x82): 32 samples in 84 bytes, each with an individual angle correction to subtract;
-- ultra (0x84): 96 samples in 132 bytes, one of three neighbours is absolute and two are differences; angles follow from
-  the distances, as in the manufacturer's library;
-- dense (0x85): 40 samples in 84 bytes.
+- ultra (0x84): 96 samples in 132 bytes, of each three neighbours, one is absolute and two are differences; angle
+corrections follow from the distances, as in the manufacturer's library; - dense (0x85): 40 samples in 84 bytes.
 
-The last three state their start angle; their samples are spread evenly up to the start of the next record. Angles
-increase clockwise seen from above, 0 is straight ahead.
+The last three forms contain their start angle; their samples are spread evenly up to the start of the next record.
+Angles increase clockwise seen from above; 0 is straight ahead.
 """
 
 import functools
@@ -34,7 +33,7 @@ TURN_Q6: Final = 360 << 6
 
 
 class RplidarCommand(IntEnum):
-    """Second byte of a request; those from 0x80 on have a payload."""
+    """Second byte of a request; commands from 0x80 upwards have a payload."""
 
     STOP = 0x25
     RESET = 0x40
@@ -77,7 +76,7 @@ class ConfigKey(IntEnum):
 
 
 class ScanMode(NamedTuple):
-    """Scan mode of a unit."""
+    """A unit's scan mode."""
 
     number: int
     name: str
@@ -89,7 +88,7 @@ class ScanMode(NamedTuple):
 
 
 class RplidarModel(NamedTuple):
-    """Data sheet of a model."""
+    """Data sheet of one model."""
 
     title: str
     number: int
@@ -161,7 +160,7 @@ def express_request(mode: int) -> bytes:
 
 
 def config_request(key: ConfigKey, mode: int = 0) -> bytes:
-    """Encode a request for a property of a mode, or of the unit."""
+    """Encode a request for a property of a mode or of the unit."""
     own = key in (ConfigKey.MODE_COUNT, ConfigKey.TYPICAL_MODE)
     return request(RplidarCommand.CONFIG, struct.pack("<I", key) + (b"" if own else struct.pack("<H", mode)))
 
@@ -187,7 +186,7 @@ def parse_descriptor(data: bytes) -> Descriptor:
 
 
 class RplidarIdentity(NamedTuple):
-    """Answer to INFO."""
+    """Reply to INFO."""
 
     model: int
     firmware: tuple[int, int]
@@ -207,7 +206,7 @@ def build_info(identity: RplidarIdentity) -> bytes:
 
 
 class Health(NamedTuple):
-    """Answer to HEALTH."""
+    """Reply to HEALTH."""
 
     status: int
     """0 good, 1 warning, 2 protection stop."""
@@ -235,10 +234,10 @@ SURE: Final = 8
 
 
 class RecordParser:
-    """Extracts records of one type from bytes; counts the bytes outside of records.
+    """Extracts records of one type from a byte stream; counts the bytes outside records.
 
     Args:
-        kind: kind of the samples.
+        kind: sample type.
     """
 
     def __init__(self, kind: DataType) -> None:
@@ -268,7 +267,7 @@ class RecordParser:
         return records
 
     def _standard(self) -> list[Record]:
-        """Return valid samples; after damage ``SURE`` consecutive valid ones are needed to resynchronise."""
+        """Return valid samples; after damage, ``SURE`` consecutive valid samples are needed to resynchronise."""
         buffer, records = self._buffer, []
         while len(buffer) >= self._size * (1 if self._sound else SURE):
             whole = len(buffer) // self._size
@@ -355,7 +354,7 @@ _LEVELS: Final = ((3328, 1 << 14, 4), (1792, 1 << 12, 3), (1280, 1 << 11, 2), (5
 
 
 def ultra_decode(codes: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Decode the distances (mm) of 12-bit codes, and the number of bits that each code omits."""
+    """Decode distances (mm) from 12-bit codes, and the number of bits that each code omits."""
     distances, levels = np.zeros_like(codes), np.zeros_like(codes)
     for least, base, level in reversed(_LEVELS):
         there = codes >= least
@@ -392,7 +391,7 @@ def ultra_distances(data: bytes, following: bytes) -> Array:
 
 
 def build_ultra(millimetres: NDArray[np.int64]) -> bytes:
-    """Encode the body of an ultra record from its distances and the first following one, (97,), mm; 0 = no return."""
+    """Encode the body of an ultra record from its distances and the one that follows, (97,) (mm); 0 = no return."""
     codes = ultra_encode(millimetres[::3])
     major, level = ultra_decode(codes)
     base, base_level = major[:-1], level[:-1]
@@ -431,7 +430,7 @@ def build_capsule(start: int, body: bytes, *, fresh: bool) -> bytes:
 def build_standard(
     turns: Array, millimetres: NDArray[np.int64], qualities: NDArray[np.int64], starts: NDArray[np.bool_]
 ) -> bytes:
-    """Encode standard samples: angles (turns), distances (mm), qualities below 64, and starts of a turn; each (n,)."""
+    """Encode standard samples: angles (turns), distances (mm), qualities below 64, start-of-turn flags; each (n,)."""
     angle = np.rint(turns * TURN_Q6).astype(np.int64) % TURN_Q6
     distance = np.minimum(millimetres * 4, 0xFFFF)
     rows = np.empty((len(turns), 5), np.uint8)

@@ -1,4 +1,4 @@
-"""Requests to an RPLIDAR, one at a time, from any state it may have been left in."""
+"""Requests to an RPLIDAR, one at a time, whatever state it was left in."""
 
 import struct
 from dataclasses import dataclass
@@ -64,10 +64,10 @@ class RplidarSession:
         """Stop the unit and identify it; a unit in protection stop is reset once.
 
         Raises:
-            DeviceFaultError: it remains in protection stop.
-            DeviceTimeoutError: silence.
-            ProtocolError: answers that violate the protocol.
-            WrongDeviceError: another device, or another unit than configured.
+            DeviceFaultError: the unit remains in protection stop.
+            DeviceTimeoutError: the unit is silent.
+            ProtocolError: answers violate the protocol.
+            WrongDeviceError: another device answers, or another unit than the configured one.
         """
         await self.stop()
         identity = await self._identify()
@@ -90,8 +90,8 @@ class RplidarSession:
         """Start scanning.
 
         Raises:
-            DeviceTimeoutError: no answer.
-            ProtocolError: it sends data of a type other than the mode's.
+            DeviceTimeoutError: the unit does not answer.
+            ProtocolError: the unit sends data of a type other than the mode's.
         """
         standard = mode.answer is DataType.STANDARD
         self._link.write(request(RplidarCommand.SCAN) if standard else express_request(mode.number))
@@ -100,10 +100,10 @@ class RplidarSession:
             raise ProtocolError(f"{self._link.name}: mode {mode.name} sends data of type 0x{found.type:02x}")
 
     async def stop(self) -> None:
-        """Stop the unit and discard the bytes it still sends.
+        """Stop the unit and discard the bytes that it still sends.
 
         Raises:
-            WrongDeviceError: it does not fall silent.
+            WrongDeviceError: the unit does not fall silent.
         """
         for _ in range(5):  # requests to stop: half a request of a dead host may swallow the first ones
             self._link.write(request(RplidarCommand.STOP))
@@ -128,7 +128,7 @@ class RplidarSession:
             return
 
     def turn_motor(self, pwm: int) -> None:
-        """Set the duty cycle of the motor (of 1023); 0 = off."""
+        """Set the motor's duty cycle (0 to 1023; 0 switches it off)."""
         self._link.write(request(RplidarCommand.MOTOR_PWM, struct.pack("<H", pwm)))
 
     def end(self) -> None:
@@ -169,7 +169,7 @@ class RplidarSession:
         return tuple(modes), typical
 
     async def _early_modes(self) -> tuple[tuple[ScanMode, ...], int]:
-        """Return the modes of firmware that does not list them."""
+        """Return the modes for firmware that does not list them."""
         standard, express = struct.unpack(
             "<HH", await self._ask(request(RplidarCommand.SAMPLE_RATE), DataType.SAMPLE_RATE)
         )
@@ -200,7 +200,7 @@ class RplidarSession:
         return await self._exactly(found.length, kind.name)
 
     async def _descriptor(self, what: str) -> bytes:
-        """Receive the next descriptor; skip the start-up text and remains of a stream before it."""
+        """Receive the next descriptor; skip start-up text and remnants of a stream before it."""
         head = await self._exactly(DESCRIPTOR, what)
         passed = 0
         while not head.startswith(ANSWER):
@@ -223,11 +223,11 @@ async def identify(link: Link, clock: Clock, settings: RplidarConfig) -> dict[st
     """Perform the handshake; the unit is idle afterwards.
 
     Returns:
-        JSON-able: ``device`` with the model's number, ``serial``, ``firmware``, ``health``, ``modes`` by name (samples
-        per second), ``typical``.
+        JSON-compatible dict: ``device`` with the model number, ``serial``, ``firmware``, ``health``, ``modes`` by name
+        (samples per second), ``typical``.
 
     Raises:
-        DeviceError: see the driver's ``run``.
+        DeviceError: the same errors as from the driver's ``run``.
     """
     unit = await RplidarSession(link, clock, settings).handshake()
     return {

@@ -1,1 +1,1 @@
-"""Code shared by scanners of all makers."""
+"""Code shared by all scanner drivers."""

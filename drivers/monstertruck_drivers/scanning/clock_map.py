@@ -1,7 +1,7 @@
 """Map the scanner's millisecond counter to the daemon's clock: drift, slews of either clock, restarts, late scans.
 
-A scan arrives one latency after its counter value, and never sooner than the minimum latency. The lower envelope of
-(arrival - counter) therefore shows the drift between both clocks; one clock comparison at the start shows the latency.
+A scan never arrives sooner after its counter value than the minimum latency. The lower envelope of (arrival - counter)
+therefore shows the drift between the two clocks; one clock comparison at the start gives the latency.
 """
 
 from collections import deque
@@ -21,7 +21,7 @@ GREATEST_DRIFT: Final = 0.12
 
 @dataclass(frozen=True, slots=True)
 class Anchor:
-    """One comparison of both clocks."""
+    """One comparison of the two clocks."""
 
     counter: int
     """Counter of the sensor (ms)."""
@@ -32,15 +32,15 @@ class Anchor:
 
 
 class ClockMap:
-    """Stamps counter values; stamps never go backwards.
+    """Converts counter values to stamps, which never go backwards.
 
     Args:
         nominal_latency: time from a counter value to the arrival of its scan without delay (ns). Used where the latency
             cannot be measured (no ``anchor``, or the counter restarted before the first scan). It is also the lower
-            bound of a measured latency, except for a slew: while the drift is still unknown, scans of a fast sensor
-            seem to arrive too soon.
+            bound of a measured latency, except for a slew: while the drift is still unknown, scans from a sensor with a
+            fast clock seem to arrive too soon.
         anchor: clock comparison made at the start.
-        turn: counter period (ms); the counter then restarts at 0.
+        turn: counter period (ms), after which the counter restarts at 0.
     """
 
     def __init__(self, nominal_latency: int, anchor: Anchor | None = None, *, turn: int = 1 << 24) -> None:
@@ -64,7 +64,7 @@ class ClockMap:
 
     @property
     def slews(self) -> int:
-        """Number of drift changes that only the start or end of a slew explains."""
+        """Number of drift changes that only the start or end of a slew can explain."""
         return self._drift.breaks
 
     @property
@@ -73,7 +73,7 @@ class ClockMap:
         return self._drift.rate
 
     def stamp(self, counter: int, arrival: int) -> int:
-        """Return the daemon's time when the sensor's counter was ``counter`` (ns).
+        """Return the daemon's time (ns) at which the sensor's counter was ``counter``.
 
         Args:
             counter: counter value (ms), later than in the previous call.
@@ -134,18 +134,18 @@ class ClockMap:
                 self._keep_latency()
 
     def _is_steady(self) -> bool:
-        """Return whether the drift just found explains all samples since the comparison."""
+        """Whether the drift just found explains all samples since the comparison."""
         third = max(len(self._settling) // 3, 1)
         envelopes = [self._lowest(self._settling[at : at + third]) for at in range(0, len(self._settling), third)]
         steady = 15 * MILLISECOND  # envelope difference of early and late samples that a constant drift explains (ns)
         return not envelopes or max(envelopes) - min(envelopes) < steady
 
     def _lowest(self, samples: Iterable[tuple[int, int]]) -> float:
-        """Return the envelope of samples at the time of the latest sample."""
+        """Return the lower envelope of samples at the time of the latest sample."""
         return min(sample + self.drift * (self._elapsed - elapsed) for elapsed, sample in samples)
 
     def _restart(self, waited: int, arrival: int) -> None:
-        """Continue after a counter restart, with the latency found so far."""
+        """Continue after a counter restart, with the latency known so far."""
         self._keep_latency()
         self._elapsed += waited
         self._newest.clear()
@@ -169,7 +169,7 @@ class ClockMap:
 
 
 class Drift:
-    """Rate of the lower envelope, from its points in the two halves of the latest blocks of samples."""
+    """Slope of the lower envelope, from its points in the two halves of the latest sample blocks."""
 
     def __init__(self) -> None:
         self.rate = 0.0
@@ -201,7 +201,7 @@ class Drift:
         self.rate = min(max(rate, -GREATEST_DRIFT), GREATEST_DRIFT)
 
     def forget(self) -> None:
-        """Drop the samples; keep the rate."""
+        """Drop the samples but keep the rate."""
         self._blocks.clear()
         self._block = []
 
@@ -220,5 +220,5 @@ class Drift:
 
 
 def _differ(rate: float, other: float) -> bool:
-    """Whether only a slew explains the difference of two drifts (s/s)."""
+    """Whether only a slew can explain the difference between two drifts (s/s)."""
     return abs(rate - other) > 3e-3

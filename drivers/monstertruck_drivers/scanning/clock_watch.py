@@ -1,4 +1,4 @@
-"""Clock watch of a scanner: reports restarts and slews, and ends a session whose scans stay late."""
+"""Clock watch for a scanner: reports restarts and slews, and ends a session whose scans stay late."""
 
 from monstertruck_drivers.scanning.clock_map import ClockMap
 from monstertruck_runtime.clock import SECOND
@@ -9,10 +9,10 @@ from monstertruck_schemas.reasons import Reason
 
 
 class ClockWatch:
-    """Stamps the scans of one scanner.
+    """Stamps one scanner's scans.
 
     Args:
-        events: sink for reports of restarts and slews of the scanner's clock.
+        events: event sink for restarts and slews of the scanner's clock.
         source: service name of the scanner.
     """
 
@@ -22,13 +22,13 @@ class ClockWatch:
         self._late_since: int | None = None
 
     def stamp(self, mapping: ClockMap, counter: int, arrival: int, port: str) -> int:
-        """Return the daemon's time when the scanner's counter was ``counter`` (ns).
+        """Return the daemon's time (ns) at which the scanner's counter was ``counter``.
 
         Args:
             mapping: clock map of the current session.
             counter: as in ``ClockMap.stamp``.
             arrival: as in ``ClockMap.stamp``.
-            port: name of the port.
+            port: port name.
 
         Raises:
             DeviceTimeoutError: scans have been late for several seconds.

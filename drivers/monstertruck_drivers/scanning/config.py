@@ -1,4 +1,4 @@
-"""Settings that all scanners with a turning head share."""
+"""Settings shared by scanners."""
 
 from typing import Annotated, Any, Literal
 
@@ -10,7 +10,7 @@ from monstertruck_schemas.body import HalfTurn
 
 
 def sheet(settings: Any) -> RangeSheet:
-    """Return the range limits of a scanner: the attribute ``sheet`` of its settings."""
+    """Return a scanner's range limits: the attribute ``sheet`` of its settings."""
     # Default for scanners whose settings have none: the URG-04LX.
     stated: RangeSheet = getattr(settings, "sheet", RangeSheet(0.02, 4.0, 0.01, 0.01))
     return stated
@@ -27,15 +27,15 @@ class ScannerConfig(Schema):
 
 
 class ReturnsConfig(ScannerConfig):
-    """Settings of a scanner that cannot tell a covered window from open ground."""
+    """Settings for a scanner that cannot tell a covered window from open ground."""
 
     no_return: Literal["unknown", "free"] = "unknown"
-    """Meaning of a beam without a return: unknown, or free up to the scanner's range. The scanner cannot tell a
+    """Meaning of a beam without a return: unknown, or free up to the scanner's maximum range. The scanner cannot tell a
     covered window from open ground"""
 
 
 class TurningHeadConfig(ReturnsConfig):
-    """Settings of a scanner that streams its beams while its head turns."""
+    """Settings for a scanner that streams its beams while its head turns."""
 
     silence: Annotated[float, Field(gt=0, le=10)] = 0.5
     """Maximum time without a byte before the session ends (s)"""

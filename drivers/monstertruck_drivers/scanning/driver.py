@@ -1,4 +1,4 @@
-"""Base of the scanners' drivers."""
+"""Base class of the scanner drivers."""
 
 from typing import Generic, TypeVar
 
@@ -16,11 +16,11 @@ class ScannerDriver(Generic[C]):
 
     Args:
         config: settings.
-        port: port of the scanner.
+        port: the scanner's port.
         clock: time.
-        out: publisher of the scans.
-        events: faults and changes of the scanner's clock.
-        name: name of the service.
+        out: scan publisher.
+        events: scanner faults and clock changes.
+        name: service name.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Turning head of an emulated scanner: its motor, its own clock, and the covers on its window."""
+"""Turning head of an emulated scanner: its motor, its clock, and covers on its window."""
 
 import math
 from collections.abc import Callable
@@ -16,19 +16,19 @@ TURNING: Final = 0.5
 
 
 class TurningHead:
-    """Clockwise turning head with a separate clock, queried at increasing instants of that clock.
+    """Head that turns clockwise and has its own clock; it must be queried at increasing times of that clock.
 
     Faults (``fault_rows``): ``cover`` covers the window between two directions (degrees from straight ahead, left
     positive): all beams there, or a random fraction of them, return the value (below 20: no return, otherwise mm).
-    ``mirror`` puts a mirror there. ``drift`` sets the rate of its clock relative to the world clock. ``blocked`` holds
-    the head. ``frequency`` changes its speed.
+    ``mirror`` puts a mirror in that sector. ``drift`` sets the rate of the head's clock relative to the world clock.
+    ``blocked`` stops the head. ``frequency`` changes its speed.
 
     Args:
-        clock: clock of the world.
-        source: source of the beams' ranges.
+        clock: world clock.
+        source: source of beam ranges.
         sheet: range limits from the data sheet.
         frequency: speed (turns/s).
-        rng: random generator of the covers.
+        rng: random generator for the covers.
     """
 
     def __init__(
@@ -48,26 +48,26 @@ class TurningHead:
     # Time
 
     def now(self) -> int:
-        """Return the time of the head's clock since its creation (ns)."""
+        """Return the head's clock time since its creation (ns)."""
         return self._elapsed + round((self._clock.now() - self._born) * self._rate)
 
     def world_time(self, time: int) -> int:
-        """Return the world's time at an instant of the head's clock (ns)."""
+        """Return the world time (ns) at a time of the head's clock."""
         return self._born + round((time - self._elapsed) / self._rate)
 
     # Motor
 
     @property
     def speed(self) -> float:
-        """Speed at the latest instant (turns/s)."""
+        """Speed at the latest queried time (turns/s)."""
         return self._speed
 
     def stop(self) -> None:
-        """Stop the head at once: its supply is off."""
+        """Stop the head immediately, because its supply is off."""
         self._speed = 0.0
 
     def turn(self, times: NDArray[np.int64]) -> Array:
-        """Return the angles (n,) at instants of the head's clock (turns); the last becomes the latest instant."""
+        """Return the head's angles (n,) at times of its clock (turns); the last becomes the latest queried time."""
         target = 0.0 if self._blocked else self.frequency
         passed = times / SECOND - self._at
         spin_up = 0.4  # time constant of the motor, s
@@ -80,12 +80,12 @@ class TurningHead:
     # Beams
 
     def measure(self, times: NDArray[np.int64]) -> tuple[Array, Array]:
-        """Return angles (turns) and ranges (m, 0 = no return) at past instants (n,) of the head's clock."""
+        """Return angles (turns) and ranges (m, 0 = no return) at past times of the head's clock, shape (n,)."""
         turned = self.turn(times)
         return turned, self.look(turned, times)
 
     def look(self, turned: Array, times: NDArray[np.int64]) -> Array:
-        """Return the ranges (n,) at angles (turns) and instants (m; 0 = no return)."""
+        """Return the ranges (m, 0 = no return), shape (n,), at angles (turns) and times."""
         bearings = -math.tau * turned
         at = np.array([self.world_time(int(time)) for time in times], np.int64)
         ranges = self._source.beams(bearings, at, self.sheet)
@@ -99,7 +99,7 @@ class TurningHead:
     # Faults
 
     def fault_rows(self) -> FaultRows:
-        """Return the head's faults, for the table of its scanner."""
+        """Return the head's faults for the scanner's fault table."""
         return {
             "cover FROM TO VALUE [SHARE]|off": self._set_cover,
             "mirror FROM TO": lambda begin, end: self._cover(begin, end, self._mirrored),

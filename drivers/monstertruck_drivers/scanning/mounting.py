@@ -1,6 +1,7 @@
-"""Mounting of a lidar on its robot: upside down, or behind parts that hide sectors.
+"""How a lidar is mounted on its robot: upside down, or behind parts that hide sectors.
 
-A beam at the bearing b of a lidar turned by pi about its x axis points where the beam at -b of an upright one does.
+The beam at bearing b of a lidar turned by pi about its x axis points in the same direction as the beam at -b of an
+upright lidar.
 """
 
 import math
@@ -24,18 +25,18 @@ def upright(mount: Mount) -> Mount:
 
 
 def turned_by_roll(mount: Mount) -> Mount:
-    """Return the same orientation by the other Euler-angle solution, with roll and yaw changed by half a turn."""
+    """Return the same orientation as the other Euler-angle solution, with roll and yaw changed by half a turn."""
     half_turn = {name: math.remainder(getattr(mount, name) + math.pi, math.tau) for name in ("roll", "yaw")}
     return mount.model_copy(update={**half_turn, "pitch": math.remainder(math.pi - mount.pitch, math.tau)})
 
 
 class MountedScans:
-    """Publisher that converts the scans of a lidar to those of an upright one and masks hidden beams.
+    """Publisher that converts scans to those of an upright lidar and masks hidden beams.
 
     Args:
-        out: publisher of the scans.
-        mount: mount of the lidar.
-        hidden: hidden sectors: first and last bearing counter-clockwise (rad).
+        out: scan publisher.
+        mount: the lidar's mount.
+        hidden: hidden sectors, each as its first and last bearing, counter-clockwise (rad).
     """
 
     def __init__(self, out: Publisher[LaserScan], mount: Mount, hidden: Sequence[tuple[float, float]]) -> None:

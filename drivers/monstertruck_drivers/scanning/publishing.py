@@ -1,4 +1,4 @@
-"""Publishes the revolutions of a turning head as scans."""
+"""Publish the revolutions of a turning head as scans."""
 
 import math
 
@@ -27,11 +27,11 @@ def publish(
     Args:
         turn: the revolution.
         origin: daemon's time at the zero of the samples' clock (ns).
-        received: arrival time of its last sample (ns).
-        sheet: ranges and noise of the scanner.
-        config: settings of the scanner.
-        out: publisher of the scans.
-        name: name of the service; the default of the frame.
+        received: arrival time of the revolution's last sample (ns).
+        sheet: the scanner's ranges and noise.
+        config: scanner settings.
+        out: scan publisher.
+        name: service name; also the default frame.
     """
     start = math.pi - math.tau * turn.first
     count = len(turn.ranges)

@@ -1,4 +1,4 @@
-"""Convert samples of a turning head to scans: cut revolutions at the rear, resample them to equal angular steps.
+"""Convert samples from a turning head to scans: cut revolutions at the rear and resample them to equal angular steps.
 
 The head measures at a constant rate while its speed varies, so the number of samples differs between revolutions.
 Angles are fractions of a turn in the head's turning direction; 0 is the scanner's x axis.
@@ -17,7 +17,7 @@ MISSING: Final = NO_ECHO + 1
 
 
 class BeamSamples(NamedTuple):
-    """Samples in the order of measurement; each array has shape (n,)."""
+    """Samples in measurement order; each array has shape (n,)."""
 
     turns: Array
     """Angle, modulo whole turns (turns)."""
@@ -59,7 +59,7 @@ class TurnCutter:
         self._begun = False
 
     def add(self, samples: BeamSamples) -> list[BeamSamples]:
-        """Add samples; returns the completed revolutions, with angles after the cut, 0 to 1."""
+        """Add samples; return the completed revolutions, with angles from the cut, 0 to 1."""
         if not len(samples.turns):
             return []
         behind = np.mod(samples.turns - 0.5, 1.0)  # where a revolution is cut
@@ -84,14 +84,15 @@ class TurnCutter:
 
 
 def on_equal_steps(samples: BeamSamples) -> HeadTurn | None:
-    """Resample a revolution to equal steps, each sample at the nearest step; None if too few samples define the step.
+    """Resample a revolution to equal steps, moving each sample to the nearest; None if there are too few samples.
 
-    Of two samples at one step, the shorter range is kept. The step is the mean spacing of neighbours. The beams are at
-    the mean phase of the samples, so no sample moves by more than half a step while the head turns evenly. The last
-    beam is at the last sample: of one sample more than steps, the first is dropped, as the last has its direction.
+    If two samples fall on one step, the shorter range is kept. The step is the mean spacing of neighbours. The beams
+    are at the mean phase of the samples, so no sample moves by more than half a step while the head turns evenly. The
+    last beam is at the last sample: if there is one sample more than steps, the first is dropped, because the last has
+    the same direction.
 
     Args:
-        samples: one revolution, with angles after the cut, 0 to 1.
+        samples: one revolution, with angles from the cut, 0 to 1.
     """
     order = np.argsort(samples.turns, kind="stable")
     turns = samples.turns[order]
@@ -127,7 +128,7 @@ def _mean_step(turns: Array) -> float | None:
 
 
 class ArrivalTimes:
-    """Times the revolutions of a head whose samples carry no time, from their arrival times.
+    """Estimates the times of revolutions from arrival times, for a head whose samples carry no time.
 
     No sample arrives before its measurement, so the promptest sample fixes a revolution's time. No revolution begins
     later than the end of the previous one plus the time that the head may have lost by slowing down.
@@ -158,7 +159,7 @@ class ArrivalTimes:
 
 
 def codes_of(turn: HeadTurn, *, free: bool) -> NDArray[np.uint8]:
-    """Return the beam codes of a revolution, as in ``LaserScan``.
+    """Return the beam codes of a revolution, as defined in ``LaserScan``.
 
     Args:
         turn: the revolution.

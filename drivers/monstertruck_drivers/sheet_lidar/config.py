@@ -1,4 +1,4 @@
-"""Settings of a laser scanner described by its data sheet."""
+"""Settings for a laser scanner described by its data sheet."""
 
 import math
 from typing import Annotated, Literal, Self
@@ -14,7 +14,7 @@ from monstertruck_schemas.base import Positive
 class SheetLidarConfig(ReturnsConfig):
     """Laser scanner of any manufacturer, described by its data sheet, for simulation before its driver exists.
 
-    On a robot it is any device that sends the frames of ``sheet_lidar/protocol.py``, such as a microcontroller.
+    On a robot, it is any device that sends the frames of ``sheet_lidar/protocol.py``, such as a microcontroller.
     """
 
     kind: Literal["sheet_lidar"] = "sheet_lidar"
@@ -43,7 +43,7 @@ class SheetLidarConfig(ReturnsConfig):
 
     @property
     def increment(self) -> float:
-        """Angle from beam to beam, counter-clockwise positive (rad); a whole turn ends one step before its start."""
+        """Angle between beams (rad), counter-clockwise positive; a full turn ends one step before its start."""
         steps = self.beams if self.field_of_view == math.tau else self.beams - 1
         return (-1.0 if self.direction == "clockwise" else 1.0) * self.field_of_view / steps
 
@@ -54,12 +54,12 @@ class SheetLidarConfig(ReturnsConfig):
 
     @property
     def time_increment(self) -> float:
-        """Time from beam to beam (s)."""
+        """Time between beams (s)."""
         return abs(self.increment) / math.tau / self.rate
 
     @property
     def sheet(self) -> RangeSheet:
-        """Ranges and errors."""
+        """Range limits and errors."""
         return RangeSheet(self.range_min, self.range_max, self.error, self.relative_error, self.range_dark)
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""Driver of a laser scanner described by its data sheet: receives and publishes every scan."""
+"""Driver for a laser scanner described by its data sheet: receives and publishes every scan."""
 
 import numpy as np
 
@@ -19,16 +19,16 @@ EXPECTED = "of a scanner with the configured number of beams: another device, or
 
 
 class SheetLidarDriver(ScannerDriver[SheetLidarConfig]):
-    """Scanner on a port."""
+    """Driver for a scanner on a port."""
 
     async def run(self, ready: Ready) -> None:
         """Serve one session.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: silence, or scans that arrive late for seconds.
-            ProtocolError: bytes without a scan.
-            WrongDeviceError: the bytes at the start contain no scan with that number of beams.
+            DeviceLostError: the scanner was unplugged.
+            DeviceTimeoutError: the scanner is silent, or its scans have arrived late for several seconds.
+            ProtocolError: bytes arrive without a valid scan.
+            WrongDeviceError: the first bytes contain no scan with the configured number of beams.
             PortBusyError: another process holds the port.
         """
         config = self._config
@@ -73,10 +73,10 @@ async def identify(link: Link, clock: Clock, settings: SheetLidarConfig) -> dict
     """Wait for one scan.
 
     Returns:
-        JSON-able: ``beams``, ``stamp_ms``, ``returns``.
+        JSON-compatible dict: ``beams``, ``stamp_ms``, ``returns``.
 
     Raises:
-        DeviceError: see the driver's ``run``.
+        DeviceError: the same errors as from the driver's ``run``.
     """
     stream = DeviceStream(link, clock, SheetParser(settings.beams).feed)
     scan = (await stream.first(settings.first_scan, EXPECTED))[-1]

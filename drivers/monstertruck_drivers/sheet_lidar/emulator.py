@@ -1,4 +1,4 @@
-"""Device side of a laser scanner described by its data sheet."""
+"""Emulated laser scanner described by its data sheet."""
 
 import asyncio
 import math
@@ -24,13 +24,13 @@ COUNTER: Final = "counter"
 class SheetLidarEmulator(FaultyDevice):
     """Scanner that streams from power-up.
 
-    Faults (``inject``): ``silent on|off``, ``bad_crc N`` (the next N scans), and the faults of the head.
+    Faults (``inject``): ``silent on|off``, ``bad_crc N`` (the next N scans), and the head's faults.
 
     Args:
         clock: time.
-        source: source of the ranges.
+        source: range source.
         config: data sheet.
-        seed: seed of covers.
+        seed: seed for covers.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class SheetLidarEmulator(FaultyDevice):
                 self.received.extend(await end.read())
 
     def power_cycle(self) -> None:
-        """Switch the supply off and on: the clock starts at 0, the head is stationary."""
+        """Switch the supply off and on: the clock restarts at 0, and the head is stationary."""
         self.head.stop()
         self._powered_at = self.head.now()
 
@@ -92,5 +92,5 @@ class SheetLidarEmulator(FaultyDevice):
 
 
 def emulated(setup: EmulatorSetup) -> SheetLidarEmulator:
-    """Create the scanner of a simulated robot."""
+    """Create a simulated robot's scanner."""
     return SheetLidarEmulator(setup.clock, setup.room, setup.settings, seed=setup.seed)

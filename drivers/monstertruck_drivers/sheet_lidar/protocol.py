@@ -1,8 +1,8 @@
-"""Frames of a laser scanner described by its data sheet (protocol of this project).
+"""Frames of a laser scanner described by its data sheet (a protocol of this project).
 
-A frame is one scan, numbers with the low byte first: "SL", number of beams (2 bytes), milliseconds of the scanner's
-clock at the first beam (3 bytes, wraps), a range of 2 bytes for each beam (mm; 0 = no return), and the
-CRC-16 (CCITT, from 0) of all bytes before it. The scanner streams without a request and accepts no commands.
+A frame is one scan, with numbers sent low byte first: "SL", number of beams (2 bytes), milliseconds of the scanner's
+clock at the first beam (3 bytes, wraps), a 2-byte range for each beam (mm; 0 = no return), and the CRC-16 (CCITT,
+initial value 0) of all preceding bytes. The scanner streams without a request and accepts no commands.
 """
 
 import binascii
@@ -30,17 +30,17 @@ class SheetScan(NamedTuple):
 
 
 def build(scan: SheetScan) -> bytes:
-    """Return the frame of a scan."""
+    """Encode a scan as a frame."""
     stamp = scan.stamp % STAMP_TURN
     body = _HEAD.pack(HEADER, len(scan.ranges), stamp & 0xFFFF, stamp >> 16) + scan.ranges.astype("<u2").tobytes()
     return body + _CRC.pack(binascii.crc_hqx(body, 0))
 
 
 class SheetParser:
-    """Extracts scans from bytes; counts the bytes outside of scans.
+    """Extracts scans from a byte stream; counts the bytes outside scans.
 
     Args:
-        beams: beams per scan; frames with another number are rejected.
+        beams: beams per scan; frames with a different number are rejected.
     """
 
     def __init__(self, beams: int) -> None:

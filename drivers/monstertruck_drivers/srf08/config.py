@@ -1,4 +1,4 @@
-"""Settings of SRF08 sonars behind a USB-ISS."""
+"""Settings for SRF08 sonars behind a USB-ISS."""
 
 from math import pi
 from typing import Annotated, Literal, Self
@@ -26,7 +26,7 @@ class SonarConfig(Schema):
 
 
 def five_sonars() -> dict[str, SonarConfig]:
-    """Left, front left, front, front right and right sonar, as on the wall follower."""
+    """Left, front-left, front, front-right and right sonars, as on the wall follower."""
     places = {
         "l": (0.05, 0.05, pi / 2),
         "fl": (0.10, 0.05, pi / 4),

@@ -1,4 +1,4 @@
-"""Driver of SRF08 sonars: groups fire in turn, and every round yields one message."""
+"""SRF08 driver: groups of sonars fire in turn, and every round yields one message."""
 
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.srf08 import protocol
@@ -17,18 +17,18 @@ LATER = 0.004
 
 
 class Srf08Driver:
-    """Fires and reads the sonars, and sets their gain and range, which they lose with their supply.
+    """Fires and reads the sonars, and sets their gain and range, which they lose at power-off.
 
-    A sonar that does not answer, or repeats its answer to the microsecond, is reported as not answering; the others
-    continue.
+    A sonar that does not answer, or repeats the same flight time to the microsecond, is reported as not answering; the
+    other sonars continue.
 
     Args:
         config: sonars, groups, limits.
-        port: port of the USB-ISS.
+        port: the USB-ISS's port.
         clock: time.
         out: ranges.
-        events: loss and return of sonars.
-        name: name of the service.
+        events: sonars lost and returned.
+        name: service name.
     """
 
     def __init__(
@@ -58,10 +58,10 @@ class Srf08Driver:
         """Serve one session.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: no answer from the USB-ISS or from any sonar.
-            ProtocolError: answers out of step.
-            WrongDeviceError: another device.
+            DeviceLostError: the USB-ISS was unplugged.
+            DeviceTimeoutError: the USB-ISS does not answer, or no sonar does.
+            ProtocolError: answers do not match the requests.
+            WrongDeviceError: another device answers.
             PortBusyError: another process holds the port.
         """
         config = self._config

@@ -1,4 +1,4 @@
-"""Device side of SRF08 sonars behind a USB-ISS, byte for byte."""
+"""Emulated SRF08 sonars behind a USB-ISS, byte for byte."""
 
 from dataclasses import dataclass
 from math import inf
@@ -30,7 +30,7 @@ SOUND: Final = 343.0
 
 @dataclass(slots=True)
 class Module:
-    """One sonar; it loses its gain and range with the supply."""
+    """One sonar; it loses its gain and range at power-off."""
 
     name: str
     gain: int = 31
@@ -45,7 +45,7 @@ class Module:
 
 
 class Srf08Emulator(FaultyDevice):
-    """A USB-ISS with one SRF08 for each sonar of the settings.
+    """A USB-ISS with one SRF08 for each sonar in the settings.
 
     Faults (`inject`): ``silent on|off`` (the USB-ISS), ``dead NAME on|off`` (off the bus), ``stuck NAME on|off`` (the
     same flight time forever), ``ghost NAME METRES|off`` (a false echo), ``brownout NAME`` (loses gain and
@@ -53,9 +53,9 @@ class Srf08Emulator(FaultyDevice):
 
     Args:
         clock: time.
-        source: physics.
+        source: physics to measure.
         settings: names and addresses.
-        seed: seed of the timers' jitter.
+        seed: seed for the timer jitter.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class Srf08Emulator(FaultyDevice):
                     end.write(answer)
 
     def power_cycle(self) -> None:
-        """Supply off and on."""
+        """Switch the supply off and on."""
         self._i2c = False
         for module in self.modules.values():
             module.gain, module.range, module.busy_until, module.pending = 31, 255, 0, False
@@ -193,7 +193,7 @@ class Srf08Emulator(FaultyDevice):
 
 
 def _size(buffer: bytes) -> int | None:
-    """Return the length of the command at the start of ``buffer``; None: not yet known."""
+    """Return the length of the command at the start of ``buffer``; None if it is not yet known."""
     if not buffer:
         return None
     if buffer[0] == ISS:
@@ -204,5 +204,5 @@ def _size(buffer: bytes) -> int | None:
 
 
 def emulated(setup: EmulatorSetup) -> Srf08Emulator:
-    """Create the sonars of a simulated robot."""
+    """Create a simulated robot's sonars."""
     return Srf08Emulator(setup.clock, setup.physics.sonars, setup.settings, seed=setup.seed)

@@ -1,8 +1,8 @@
-"""Bytes to a USB-ISS in I2C mode, and registers of the SRF08 behind it.
+"""USB-ISS commands in I2C mode, and registers of the SRF08 behind it.
 
 Sources: Devantech, "USB-ISS Technical Specification" and "I2C Mode"; "SRF08 Ultrasonic Ranger, Technical
-Specification". An answer of the USB-ISS has no identifier and no checksum: only its length is known. Bits that no
-module drives on the bus read as ones, so a module that is ranging or absent has the software revision 0xFF.
+Specification". A USB-ISS answer has no identifier and no checksum; only its length is known. Bits that no module drives
+on the bus read as ones, so a module that is ranging or absent appears with software revision 0xFF.
 """
 
 from enum import IntEnum
@@ -31,7 +31,7 @@ RANGE_STEP: Final = 0.043
 
 
 class Srf08Register(IntEnum):
-    """Registers for writing; reading returns revision, light, and the first echo's high and low byte."""
+    """Write registers; reads return the revision, the light level, and the high and low bytes of the first echo."""
 
     COMMAND = 0
     GAIN = 1
@@ -39,7 +39,7 @@ class Srf08Register(IntEnum):
 
 
 class Srf08Reading(NamedTuple):
-    """Content of registers 0 to 3."""
+    """Contents of registers 0 to 3."""
 
     revision: int
     light: int
@@ -61,7 +61,7 @@ def write(address: int, register: int, value: int) -> bytes:
 
 
 def read(address: int) -> bytes:
-    """Return a request for revision, light and the first echo; the answer has ``READ_SIZE`` bytes."""
+    """Return a request for the revision, the light level and the first echo; the answer has ``READ_SIZE`` bytes."""
     return bytes((I2C_AD1, address | 1, 0, READ_SIZE))
 
 
@@ -69,7 +69,7 @@ def parse_reading(data: bytes) -> Srf08Reading:
     """Parse the answer to ``read``.
 
     Raises:
-        ValueError: wrong length.
+        ValueError: the length is wrong.
     """
     if len(data) != READ_SIZE:
         raise ValueError(f"expected {READ_SIZE} bytes, got {len(data)}")
@@ -82,5 +82,5 @@ def range_setting(metres: float) -> int:
 
 
 def ranging_time(setting: int) -> float:
-    """Time for which a module ranges and does not answer (s), by its range register; 65 ms at the factory setting."""
+    """Time for which a module is ranging and does not answer (s), given its range register; 65 ms by default."""
     return (setting + 1) * 65e-3 / 256

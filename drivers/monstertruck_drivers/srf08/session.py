@@ -1,4 +1,4 @@
-"""Requests and replies of a USB-ISS and its sonars; shared by the driver and `identify`."""
+"""Requests to a USB-ISS and its sonars, and their replies; shared by the driver and `identify`."""
 
 from monstertruck_drivers.link import Link
 from monstertruck_drivers.srf08 import protocol
@@ -13,7 +13,7 @@ class Srf08Session:
 
     Args:
         link: open link.
-        timeout: timeout of an answer (s).
+        timeout: maximum time to wait for an answer (s).
     """
 
     def __init__(self, link: Link, timeout: float) -> None:
@@ -24,9 +24,9 @@ class Srf08Session:
         """Send a command and return its answer.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: no answer within the timeout.
-            ProtocolError: unrequested bytes.
+            DeviceLostError: the USB-ISS was unplugged.
+            DeviceTimeoutError: the answer did not arrive within the timeout.
+            ProtocolError: unrequested bytes arrived.
         """
         if count := self._link.discard():
             raise ProtocolError(f"{self._link.name}: {count} unexpected bytes: answers are out of step with requests")
@@ -40,10 +40,10 @@ class Srf08Session:
         """Identify the USB-ISS and set it to I2C mode; return its firmware version.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: silence.
-            WrongDeviceError: another device.
-            ProtocolError: it refuses the mode.
+            DeviceLostError: the USB-ISS was unplugged.
+            DeviceTimeoutError: the USB-ISS does not answer.
+            WrongDeviceError: another device answers.
+            ProtocolError: the USB-ISS refuses the mode.
         """
         answer = b""
         attempts = 3  # a host that died may have left half a command, which the USB-ISS drops after a pause
@@ -78,10 +78,10 @@ async def identify(link: Link, clock: Clock, settings: Srf08Config) -> dict[str,
     """Read the version of the USB-ISS and the software revision at every address.
 
     Returns:
-        JSON-able: ``firmware`` of the USB-ISS, ``sonars`` (address to software revision).
+        JSON-compatible dict: ``firmware`` of the USB-ISS, ``sonars`` (address to software revision).
 
     Raises:
-        DeviceError: see the driver's ``run``.
+        DeviceError: the same errors as from the driver's ``run``.
     """
     session = Srf08Session(link, settings.timeout)
     firmware = await session.start()

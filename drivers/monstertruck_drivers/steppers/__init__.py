@@ -1,1 +1,1 @@
-"""Stepper motors on one microcontroller, by a line protocol of this project."""
+"""Stepper motors on one microcontroller, controlled over a line protocol of this project."""

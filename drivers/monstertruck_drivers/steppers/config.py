@@ -1,4 +1,4 @@
-"""Settings of the stepper motors in the configuration file."""
+"""Stepper motor settings in the configuration file."""
 
 import math
 from typing import Annotated, Literal, Self
@@ -37,9 +37,9 @@ class StepperConfig(Schema):
     answer_timeout: Annotated[float, Field(gt=0, le=0.2)] = 0.05
     """Timeout of an answer (s)"""
     command_timeout: Seconds = 0.25
-    """Maximum age of the latest command (s); then the motors ramp down to rest"""
+    """Maximum age of the latest command (s), after which the motors ramp down to rest"""
     quick_stop_after: Seconds = 1.0
-    """Maximum age of the latest command (s); then the motors quick-stop"""
+    """Maximum age of the latest command (s), after which the motors quick-stop"""
     watchdog: Annotated[float, Field(ge=0.05, le=2.0)] = 0.3
     """Time without a run request after which the controller itself stops the motors (s)"""
 
@@ -50,12 +50,12 @@ class StepperConfig(Schema):
 
     @property
     def turn(self) -> float:
-        """Angle of a step (rad)."""
+        """Angle per step (rad)."""
         return 2.0 * math.pi / self.steps_per_turn
 
     @property
     def motor_limits(self) -> MotorLimits:
-        """Limits of a motor."""
+        """Motor limits."""
         return MotorLimits(
             self.max_rate * self.turn, self.acceleration * self.turn, self.quick_deceleration * self.turn
         )

@@ -1,9 +1,9 @@
-"""Drive service of several shafts on one stepper controller: ``cmd/drive*`` in, ``sensor/drive*`` out.
+"""Drive service for several shafts on one stepper controller: ``cmd/drive*`` in, ``sensor/drive*`` out.
 
 One exchange per cycle sends the set-points of all shafts and receives the status, which is the feedback of every shaft.
 
 The controller's watchdog stops the motors when the host is silent. Every session starts with a quick stop. It ends with
-quick stops until the motors rest, and then switches the coils off, even if the motors still turn.
+quick stops until the motors are at rest or a timeout expires, and then switches the coils off.
 """
 
 import contextlib
@@ -42,7 +42,7 @@ MODES: Final = {
 
 
 class MotorSetpoints(NamedTuple):
-    """Set-points of the motors."""
+    """Motor set-points."""
 
     state: MotorState
     rates: tuple[int, ...] = ()
@@ -50,11 +50,11 @@ class MotorSetpoints(NamedTuple):
 
 
 def setpoint_of(commands: Sequence[DriveCommand | None], now: int, config: StepperConfig) -> MotorSetpoints:
-    """Combine the latest commands of all shafts into set-points; implements the host's deadman.
+    """Combine the latest commands of all shafts into set-points; implements the host-side deadman.
 
     Args:
-        commands: latest command of every shaft, if any.
-        now: time (ns).
+        commands: latest command for every shaft, if any.
+        now: current time (ns).
         config: signs, limits and timeouts.
     """
     mode, known = requested(commands, now, config.quick_stop_after)
@@ -69,7 +69,7 @@ def setpoint_of(commands: Sequence[DriveCommand | None], now: int, config: Stepp
 
 
 class StepperDriver(MotorBoard[StepperConfig, StepperSession]):
-    """Service of all motors on one controller; see ``MotorBoard``."""
+    """Drive service for all motors on one controller; see ``MotorBoard``."""
 
     def __init__(
         self,
@@ -98,7 +98,7 @@ class StepperDriver(MotorBoard[StepperConfig, StepperSession]):
         """See the base class.
 
         Raises:
-            DeviceMismatchError: the number of motors or steps per turn differs from the configuration.
+            DeviceMismatchError: the number of motors or the steps per turn differ from the configuration.
             WrongDeviceError: another device answers.
         """
         config = self._config
@@ -135,8 +135,8 @@ class StepperDriver(MotorBoard[StepperConfig, StepperSession]):
         """See the base class.
 
         Raises:
-            DeviceRestartedError: the controller restarted while it was in use.
-            DeviceStoppedError: its watchdog stopped motors that should turn.
+            DeviceRestartedError: the controller restarted while in use.
+            DeviceStoppedError: the controller's watchdog stopped motors that should turn.
         """
         setpoint = self._setpoint()
         self._sent = MODES[setpoint.state]

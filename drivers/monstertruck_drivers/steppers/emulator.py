@@ -1,7 +1,7 @@
-"""Device side of the stepper controller: line protocol, ramps, watchdog, and steppers that lose steps.
+"""Emulated stepper controller: line protocol, ramps, watchdog, and steppers that lose steps.
 
-Behaviour of the real controller: it sends only answers, ignores damaged lines, counts the commanded steps, not those of
-the rotor, steps at whole periods of its timer, and starts at 0 after every power-up.
+Like the real controller, it only answers requests, ignores damaged lines, counts commanded steps rather than the
+rotor's, steps at whole multiples of its timer period, and starts at 0 after every power-up.
 """
 
 import asyncio
@@ -44,12 +44,12 @@ class StepperEmulator(FaultyDevice):
     """The controller with its motors.
 
     Faults (``inject``): ``overload MOTOR on|off`` (the rotor blocks), ``silent on|off`` (no answers), ``late SECONDS
-    [COUNT]`` (late answers), ``reset`` (the processor restarts at any point), ``noise COUNT`` (COUNT answers have a
-    wrong byte), ``runaway`` (the firmware disobeys with all motors, see ``DisobedientMotor``).
+    [COUNT]`` (late answers), ``reset`` (the processor restarts at any point), ``noise COUNT`` (COUNT answers contain a
+    wrong byte), ``runaway`` (all motors disobey, see ``DisobedientMotor``).
 
     Args:
         clock: time.
-        plants: loads of the motors; missing ones are replaced by free motors.
+        plants: motor loads; missing entries are replaced by unloaded motors.
         motors: number of motors.
         steps_per_turn: steps per turn of each motor.
     """
@@ -107,7 +107,7 @@ class StepperEmulator(FaultyDevice):
         self._turn(None, self._quick)
 
     def power_cycle(self) -> None:
-        """Switch the supply off and on: coils off, counters at 0, settings of the factory."""
+        """Switch the supply off and on: coils off, counters at 0, factory settings."""
         self._boot()
         self._fed_again.set()
 
@@ -198,7 +198,7 @@ class StepperEmulator(FaultyDevice):
         self._turn(None if state is MotorState.OFF else self._ordered, self._quick)
 
     def _turn(self, rates: list[float] | None, acceleration: float) -> None:
-        """Command rates (steps/s); None: no current."""
+        """Command rates (steps/s); None for no current."""
         self._asked = rates
         rates = self._disobeyed(rates)
         self._powered, self._ramp = rates is not None, acceleration * self._rpm
@@ -209,7 +209,7 @@ class StepperEmulator(FaultyDevice):
         self._drive()
 
     def _disobeyed(self, rates: list[float] | None) -> list[float] | None:
-        """Return the rates that the firmware applies for commanded rates."""
+        """Return the rates that the firmware applies instead of the commanded ones."""
         if (runaway := self._runaway) is None:
             return rates
         now, asked = self._clock.now(), [None] * self._identity.motors if rates is None else rates
@@ -221,7 +221,7 @@ class StepperEmulator(FaultyDevice):
         return turning or None
 
     def _drive(self) -> None:
-        """Let the rotors follow, within their torque."""
+        """Let the rotors follow the commanded rates within their torque limits."""
         now = self._clock.now()
         for i, (plant, rate) in enumerate(zip(self._plants, self._rates, strict=True)):
             # 150.0: steps/s below which a rotor that stands follows again
@@ -233,7 +233,7 @@ class StepperEmulator(FaultyDevice):
 
     @property
     def _rpm(self) -> float:
-        """Shaft speed for one step/s (rpm)."""
+        """Shaft speed (rpm) at one step/s."""
         return 60.0 / self._identity.steps_per_turn
 
     def _status(self) -> Status:
@@ -248,7 +248,7 @@ class StepperEmulator(FaultyDevice):
         )
 
     def _reported(self) -> Status:
-        """Status as it is sent."""
+        """Status as sent to the host."""
         true, report = self._status(), self.signals.report
         state = report("state", int(true.state))
         return Status(
@@ -264,7 +264,7 @@ class StepperEmulator(FaultyDevice):
         return self._state is MotorState.RUN
 
     async def _watch(self) -> None:
-        """Watchdog: trips even if the host is silent."""
+        """Run the watchdog, which trips even if the host is silent."""
         while True:
             self._fed_again.clear()
             if not self._running:
@@ -288,7 +288,7 @@ def _stepped(rate: float) -> float:
 
 
 def emulated(setup: EmulatorSetup) -> StepperEmulator:
-    """Create the controller of all driven shafts of a simulated robot, on a line with its real speed."""
+    """Create the controller for all driven shafts of a simulated robot, with the real line speed."""
     setup.port.device.baud = STEPPERS_BAUD
     steps = {} if setup.settings is None else {"steps_per_turn": setup.settings.steps_per_turn}
     return StepperEmulator(setup.clock, setup.physics.motors[:MOTORS], **steps)

@@ -1,9 +1,10 @@
-"""Line protocol of a microcontroller with up to four stepper motors; pure codec.
+"""Line protocol of a microcontroller with up to four stepper motors (codec only, no I/O).
 
-115200 baud, 8N1. A line is ``:BODY*CCCC`` and LF, at most 160 bytes: BODY is words of printable ASCII, one space apart,
-CCCC the CRC-16/CCITT-FALSE of BODY (polynomial 0x1021, initial value 0xFFFF) in capital hex digits. The controller
-answers every complete line of the host once, with the request's sequence number (0 to 255), and sends nothing else. The
-first word of a request is a capital letter; the answer starts with the same letter in lower case:
+115200 baud, 8N1. A line is ``:BODY*CCCC`` and LF, at most 160 bytes: BODY consists of words of printable ASCII
+separated by one space, and CCCC is the CRC-16/CCITT-FALSE of BODY (polynomial 0x1021, initial value 0xFFFF) in capital
+hex digits. The controller answers every complete line from the host once, with the request's sequence number (0 to
+255), and sends nothing else. The first word of a request is a capital letter; the answer starts with the same letter in
+lower case:
 
 ======================= =================================================== ==========================================
 request                 meaning                                             answer
@@ -46,7 +47,7 @@ _MASK = 0xFFFF_FFFF
 
 
 class MotorState(IntEnum):
-    """State of the motors."""
+    """Common state of the motors."""
 
     OFF = 0
     """Coils off: the motors turn freely, as after power-up."""
@@ -72,7 +73,7 @@ class RefusalCode(IntEnum):
 
 
 class LineError(ValueError):
-    """Line outside this protocol."""
+    """A line that does not conform to the protocol."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +92,7 @@ class Line:
         """Return the words as integers.
 
         Raises:
-            LineError: wrong number of words, or a word that is not a plain decimal number.
+            LineError: the number of words is wrong, or a word is not a plain decimal number.
         """
         if count is not None and len(self.words) != count:
             raise LineError(f"{self.verb}: {len(self.words)} words, expected {count}")
@@ -101,7 +102,7 @@ class Line:
 
 
 def crc(data: bytes) -> int:
-    """CRC-16/CCITT-FALSE: polynomial 0x1021, start 0xFFFF, nothing reflected."""
+    """CRC-16/CCITT-FALSE: polynomial 0x1021, initial value 0xFFFF, no reflection."""
     return crc_hqx(data, 0xFFFF)
 
 
@@ -109,7 +110,7 @@ def decode(line: bytes) -> Line:
     """Decode one complete line, with or without its LF.
 
     Raises:
-        LineError: damaged line, or a line of another protocol.
+        LineError: the line is damaged or belongs to another protocol.
     """
     text = line.removesuffix(_END)
     body, star, check = text[1:].rpartition(b"*")
@@ -179,7 +180,7 @@ class Identity:
         """Parse an answer to ``I``.
 
         Raises:
-            LineError: not an identity.
+            LineError: the line is not an identity.
         """
         if line.verb != "i" or len(line.words) != 5:
             raise LineError(f"answer {line.verb!r}: expected an identity")
@@ -206,10 +207,10 @@ class Status:
 
     @classmethod
     def of(cls, line: Line, motors: int) -> "Status":
-        """Parse an answer of a controller with ``motors`` motors.
+        """Parse an answer from a controller with ``motors`` motors.
 
         Raises:
-            LineError: not a status.
+            LineError: the line is not a status.
         """
         if line.verb != "s":
             raise LineError(f"answer {line.verb!r}: expected a status")

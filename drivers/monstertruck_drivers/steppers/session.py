@@ -1,4 +1,4 @@
-"""Requests and replies of the controller over one open link; shared by the driver and `identify`."""
+"""Requests to the controller and its replies over one open link; shared by the driver and `identify`."""
 
 from typing import Final
 
@@ -22,7 +22,7 @@ ASK_ATTEMPTS: Final = 3
 
 
 class RequestRefusedByDeviceError(ProtocolError):
-    """The controller does not carry out a request.
+    """The controller refuses a request.
 
     Args:
         text: controller, request and reason.
@@ -40,7 +40,7 @@ class StepperSession:
     Args:
         link: open link.
         clock: time.
-        timeout: timeout of an answer (s).
+        timeout: maximum time to wait for an answer (s).
     """
 
     def __init__(self, link: Link, clock: Clock, timeout: float) -> None:
@@ -55,10 +55,10 @@ class StepperSession:
         self._seq = 0
 
     def send(self, verb: str, *words: int) -> int:
-        """Send a request without waiting for its answer; returns its number.
+        """Send a request without waiting for its answer; return its sequence number.
 
         Raises:
-            DeviceLostError: unplugged.
+            DeviceLostError: the controller was unplugged.
         """
         self._seq = (self._seq + 1) % SEQUENCES
         self._link.write(bytes(Line(verb, self._seq, tuple(map(str, words)))))
@@ -68,8 +68,8 @@ class StepperSession:
         """Send a request and wait for its answer.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: no answer within the timeout.
+            DeviceLostError: the controller was unplugged.
+            DeviceTimeoutError: the answer did not arrive within the timeout.
             ProtocolError: the controller refuses the request.
         """
         for _ in range(attempts):
@@ -83,7 +83,7 @@ class StepperSession:
         raise DeviceTimeoutError(f"{self._link.name}: no answer to {verb} within {self._timeout} s")
 
     async def status(self, verb: str, motors: int, *words: int, attempts: int = 1) -> Status:
-        """Send a request that is answered by a status. Raises the errors of ``ask``."""
+        """Send a request that is answered with a status; raises the same errors as ``ask``."""
         answer = await self.ask(verb, *words, attempts=attempts)
         try:
             return Status.of(answer, motors)
@@ -94,8 +94,8 @@ class StepperSession:
         """Identify the controller.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: silence.
+            DeviceLostError: the controller was unplugged.
+            DeviceTimeoutError: the controller is silent.
             WrongDeviceError: another device answers.
         """
         try:
@@ -135,14 +135,14 @@ def _reason(answer: Line) -> tuple[int, str]:
 
 
 async def identify(link: Link, clock: Clock, settings: StepperConfig) -> dict[str, object]:
-    """Read the identity and one status, without moving or changing anything.
+    """Read the identity and one status without moving or changing anything.
 
     Returns:
-        JSON-able: ``version``, ``motors``, ``steps_per_turn``, ``state``, ``bad_lines``, ``uptime_s``, ``positions``
-        (steps), ``rates`` (steps/s).
+        JSON-compatible dict: ``version``, ``motors``, ``steps_per_turn``, ``state``, ``bad_lines``, ``uptime_s``,
+        ``positions`` (steps), ``rates`` (steps/s).
 
     Raises:
-        DeviceError: see the driver's ``run``.
+        DeviceError: the same errors as from the driver's ``run``.
     """
     session = StepperSession(link, clock, settings.answer_timeout)
     identity = await session.identify()

@@ -1,1 +1,1 @@
-"""USB devices identified by hub and port; a hub with its devices is lost and returns as one event."""
+"""USB devices identified by hub and port; the loss or return of a hub with its devices is one event."""

@@ -1,4 +1,4 @@
-"""Configuration of the USB tree: device places, hub outages, power of ports."""
+"""Configuration of the USB tree: device places, hub outages and port power."""
 
 from enum import StrEnum
 from typing import Annotated, Self
@@ -17,7 +17,7 @@ Baud = Annotated[int, Field(ge=4800, le=1_000_000)]
 
 
 class UsbPortConfig(Schema):
-    """Device place by hub and port, which stays the same when ttyUSB numbers change."""
+    """Place of a device, given by hub and port; it remains valid when ttyUSB numbers change."""
 
     hub: Annotated[
         str, Field(pattern=r"^(usb[0-9]+|[0-9]+-[0-9]+(\.[0-9]+)*|[a-zA-Z][^\s/\"]*-usb-0:(0|[0-9]+(\.[0-9]+)*))$")
@@ -31,13 +31,13 @@ its kernel's name, which may change with the next boot: "1-1", or "usb1" for a r
     baud: Baud | None = None
     """Baud rate (bit/s); null selects the device's default. USB-CDC devices ignore it"""
     dtr: bool = True
-    """Level of the line DTR while the port is open; false lets an RPLIDAR's motor turn"""
+    """Level of the DTR line while the port is open; false lets an RPLIDAR's motor turn"""
     rts: bool = True
-    """Level of the line RTS while the port is open"""
+    """Level of the RTS line while the port is open"""
     framing: Framing | None = None
     """Format of a byte; null selects the device's default"""
     usb_id: Annotated[str, Field(pattern=r"^[0-9a-f]{4}:[0-9a-f]{4}$")] | None = None
-    """Expected vendor:product, checked before the first byte; None leaves it to the handshake"""
+    """Expected vendor:product, checked before the first byte is sent; None leaves the check to the handshake"""
     latency_ms: Annotated[int, Field(ge=1, le=255)] = 1
     """Latency timer of an FTDI adapter, set at every open"""
 
@@ -52,7 +52,7 @@ its kernel's name, which may change with the next boot: "1-1", or "usb1" for a r
         return place(self.device)
 
     def at_present(self, sysfs: Sysfs) -> Self:
-        """Return this place with current kernel names; itself if its controller is absent."""
+        """Return this place with current kernel names; or this place itself if its controller is absent."""
         name = at_present(sysfs, self.device)
         if name == self.device:
             return self
@@ -60,7 +60,7 @@ its kernel's name, which may change with the next boot: "1-1", or "usb1" for a r
 
 
 class CycleMethod(StrEnum):
-    """Method to switch a port off and on."""
+    """Method for switching a port off and on."""
 
     AUTHORIZED = "authorized"
     """The kernel drops the device and enumerates it again; power stays on."""
@@ -71,7 +71,7 @@ class CycleMethod(StrEnum):
 
 
 class PowerConfig(Schema):
-    """Switching of single ports."""
+    """Power switching of individual ports."""
 
     method: CycleMethod | None = None
     """Method to switch ports; None disables switching"""

@@ -26,7 +26,7 @@ ENUMERATION: Final = 0.12
 
 @dataclass(slots=True)
 class _HubOrDevice:
-    """Existing hub or device, plugged in or not."""
+    """A hub or device that exists, whether plugged in or not."""
 
     name: str
     usb_id: str
@@ -45,7 +45,7 @@ class _HubOrDevice:
 
 @dataclass(slots=True)
 class EmulatedWatcher:
-    """Announces changes of the emulated machine; ``deaf``: no udev and no announcements."""
+    """Reports changes of the emulated machine; if ``deaf``, there is no udev and nothing is reported."""
 
     deaf: bool = False
     _hint: Callable[[], None] | None = field(default=None)
@@ -59,7 +59,7 @@ class EmulatedWatcher:
         self._hint = None
 
     def announce(self) -> None:
-        """Announce a change."""
+        """Report a change."""
         if self._hint is not None and not self.deaf:
             self._hint()
 
@@ -114,10 +114,10 @@ class EmulatedUsb:
         """Create a device and plug it in.
 
         Args:
-            name: place, e.g. ``1-1.2``; its hub must exist.
+            name: place, such as ``1-1.2``; its hub must exist.
             usb_id: ``vendor:product``.
-            title: product.
-            node: ``ttyUSB`` (FTDI), ``ttyACM`` (CDC) or ``video``; None: no node.
+            title: product name.
+            node: ``ttyUSB`` (FTDI), ``ttyACM`` (CDC) or ``video``; None for no node.
             interface: USB interface of the node.
             serial: serial number.
             cable: emulated port behind a serial node.
@@ -228,7 +228,7 @@ class EmulatedUsb:
                 self.plug(name)
 
     def claim(self, name: str) -> None:
-        """Let a program claim the interface of a device's node through usbfs, as brltty does; the node vanishes."""
+        """Let a program claim the interface behind a device's node through usbfs, as brltty does; the node vanishes."""
         device = self._devices[name]
         self._unbind(device)
         interface = f"{name}:1.{device.interface}"
@@ -350,7 +350,7 @@ class EmulatedUsb:
         return SerialPort(path, baud, dtr=dtr, rts=rts, low_latency=low_latency, framing=framing)
 
     async def _run(self, arguments: Sequence[str]) -> tuple[int, str]:
-        """Run the only existing program: a uhubctl that switches one port."""
+        """Run the only existing program: ``uhubctl``, which switches one port."""
         self.commands.append(arguments)
         if list(arguments[:1]) != ["uhubctl"] or "uhubctl" in self.refused:
             raise FileNotFoundError(errno.ENOENT, "No such file or directory", arguments[0])

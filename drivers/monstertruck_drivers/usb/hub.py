@@ -1,10 +1,10 @@
-"""Combine simultaneous losses behind a hub into one event, and start the hub's devices in sequence.
+"""Combine simultaneous losses behind a hub into one event, and restart the hub's devices in sequence.
 
-A ``HubCoordinator`` compares snapshots and judges losses together after a short while. If a hub has vanished, or all of
-its several devices have, the topmost such hub is reported, and all devices behind it wait for the hub. Once the tree
-behind the returned hub is stable, its devices may start in order of safety. Devices that load the hub start with a
-delay after their predecessor: a lidar and a camera draw their in-rush current at the start, interfaces when plugged in.
-A device may also have to wait because its port reported over-current.
+A ``HubCoordinator`` compares snapshots and evaluates losses together after a short delay. If a hub has vanished, or all
+of its several devices have, the topmost such hub is reported, and all devices behind it wait for the hub. Once the tree
+behind the returned hub is stable, its devices may start in order of safety. A device that puts a load on the hub starts
+after a delay: a lidar or camera draws its in-rush current when it is started, whereas an interface draws it when
+plugged in. A device may also have to wait because its port reported over-current.
 """
 
 import asyncio
@@ -53,7 +53,7 @@ class _Slot:
 
 @dataclass(slots=True)
 class _HubOutage:
-    """Outage of a hub or of all its devices; ends when the devices may start."""
+    """Outage of a hub or of all its devices; it ends when the devices may start."""
 
     hub: str
     since: int
@@ -66,9 +66,9 @@ class HubCoordinator:
     """Decides which devices must wait for a hub.
 
     Args:
-        config: times and start order.
+        config: timing and start order.
         ports: configured place of every role.
-        clock: clock of the daemon.
+        clock: the daemon's clock.
         events: sink for events: hubs lost and returned, devices moved, over-current.
     """
 
@@ -95,7 +95,7 @@ class HubCoordinator:
     # Queries of a port
 
     async def wait_to_start(self, role: str) -> None:
-        """Wait until the device of ``role`` may start; returns at once for roles without a USB port."""
+        """Wait until the device of ``role`` may start; return immediately for roles without a USB port."""
         slot = self._slots.get(self._places.get(role, ""))
         while slot is not None and self._waits(slot):
             if slot.free_at is None:
@@ -105,12 +105,12 @@ class HubCoordinator:
 
     @property
     def waiting(self) -> frozenset[str]:
-        """Roles that may not start now."""
+        """Roles whose devices may not start yet."""
         slots = ((role, self._slots.get(name)) for role, name in self._places.items())
         return frozenset(role for role, slot in slots if slot is not None and self._waits(slot))
 
     def waits_for(self, role: str) -> str | None:
-        """Return in words why the device of ``role`` may not start; None if it may start."""
+        """Return the reason why the device of ``role`` may not start, as text; None if it may start."""
         name = self._places.get(role, "")
         slot = self._slots.get(name)
         if slot is None or not self._waits(slot):
@@ -126,7 +126,7 @@ class HubCoordinator:
     # Called by the watching service
 
     def update(self, snapshot: TreeSnapshot) -> None:
-        """Process a new snapshot of the tree, and everything due since the last one."""
+        """Process a new snapshot of the tree, and everything that has become due since the last one."""
         now = self._clock.now()
         self._follow_buses(snapshot)
         self._locate(snapshot.at_present)
@@ -234,7 +234,7 @@ class HubCoordinator:
         return next((self._outages[hub] for hub in (name, *ancestors(name)) if hub in self._outages), None)
 
     def _judge(self, now: int) -> None:
-        """Judge recent losses once all related losses have arrived."""
+        """Evaluate recent losses once all related losses have arrived."""
         if not self._judging or now - max(self._judging.values()) < _ns(self._config.together):
             return
         lost, self._judging = self._judging, {}
@@ -263,12 +263,12 @@ class HubCoordinator:
         return top
 
     def _back(self, outage: _HubOutage) -> list[str]:
-        """Return the returned devices behind the hub, in start order."""
+        """Return the devices behind the hub that have returned, in start order."""
         back = [name for name in outage.members if self._slots[name].present and not self._is_hub(name)]
         return sorted(back, key=self._start_rank)
 
     def _pause(self, outage: _HubOutage) -> int:
-        """Return the time without change before the devices of a returned hub may start (ns)."""
+        """Return how long the tree must be stable before the devices of a returned hub may start (ns)."""
         return _ns(self._config.settle if self._back(outage) else self._config.empty_timeout)
 
     def _release(self, now: int) -> None:
@@ -286,7 +286,7 @@ class HubCoordinator:
                 self._report_returned(outage, back, now)
 
     def _stagger(self, starting: list[str], now: int) -> None:
-        """Schedule the devices of one hub; a device that loads it starts with a delay. Hubs are independent."""
+        """Schedule one hub's devices; a device that puts a load on the hub starts after a delay."""
         turns = accumulate(name != starting[0] and self._loads(name) for name in starting)
         for turn, name in zip(turns, starting, strict=True):
             self._slots[name].free_at = now + turn * _ns(self._config.stagger)
@@ -346,7 +346,7 @@ class HubCoordinator:
         )
 
     def _report_if_moved(self, name: str, device: UsbDevice) -> None:
-        """Report a device that looks like a missing one at another place; it is never used there."""
+        """Report a device that looks like a missing one but is at another place, where it is not used."""
         for other, slot in self._slots.items():
             known = slot.device
             wanted = other in self._roles or other in self._outages
@@ -420,16 +420,16 @@ PERIOD: Final = SECOND
 
 
 class UsbService:
-    """Reads the tree on a change notification, a missed device or a due decision, and at least every few seconds.
+    """Reads the tree on a change notification, a missing device or a due decision, and at least every few seconds.
 
-    Without this service no device waits for a hub.
+    Without this service, devices do not wait for their hubs.
 
     Args:
-        config: times.
+        config: timing.
         machine: computer with the tree.
         hubs: receives every snapshot.
-        watcher: source of announcements.
-        out: publisher of the tree, on change and once per second.
+        watcher: source of change notifications.
+        out: publisher of the tree; it publishes on change and once per second.
         events: sink for events about devices that the kernel may suspend.
     """
 
@@ -474,7 +474,7 @@ class UsbService:
             self._hubs.stop_watching()
 
     async def _woken(self) -> bool:
-        """Sleep until an announcement (True) or a due time (False)."""
+        """Sleep until a change notification (True) or a due time (False)."""
         seconds = (min(self._next_look(), self._publish_at) - self._clock.now()) / SECOND
         with suppress(TimeoutError):
             async with self._clock.deadline(max(seconds, 0.0)):
@@ -519,7 +519,7 @@ class UsbService:
 
 
 async def keep_awake(machine: Machine, name: str) -> bool:
-    """Forbid the kernel to suspend a device; returns False if not permitted."""
+    """Prevent the kernel from suspending a device; return False if not permitted."""
 
     def write() -> bool:
         with suppress(OSError):

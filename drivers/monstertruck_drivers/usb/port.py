@@ -1,4 +1,4 @@
-"""USB port given by hub and port number: open its current node, lower its adapter's latency, switch its power."""
+"""USB port given by hub and port number: opens its current node, lowers its adapter's latency, switches its power."""
 
 from collections import defaultdict
 from threading import Lock
@@ -40,15 +40,15 @@ ADVICE: Final = (
 
 
 def lower_latency(sysfs: Sysfs, node: Node, latency_ms: int) -> bool:
-    """Lower the latency timer of an adapter. Blocks.
+    """Lower the latency timer of an adapter; blocks.
 
     Args:
         sysfs: sysfs with the adapter's attributes.
-        node: serial node, just read.
+        node: serial node, as just read.
         latency_ms: desired latency (ms).
 
     Returns:
-        True if writing is not permitted, so the port must be opened with low latency instead.
+        True if writing is not permitted, so that the port must be opened with low latency instead.
     """
     if node.latency_ms is None or node.latency_ms <= latency_ms:
         return False
@@ -67,7 +67,7 @@ class PortPower:
     """Cycles ports; the minimum interval per port grows: 1, 2, 4 ... 60 s.
 
     Args:
-        config: method and times.
+        config: method and timing.
         machine: computer with the ports.
         events: sink for reports of every power cycle.
     """
@@ -82,14 +82,14 @@ class PortPower:
         """Locks by first attribute; they keep the writes of one port in order, even after a caller was cancelled."""
 
     async def cycle(self, name: str) -> None:
-        """Switch the port of ``name`` off and on; its device vanishes and comes back.
+        """Switch the port of ``name`` off and on; its device vanishes and returns.
 
         Args:
             name: topology name or kernel name of the device's place.
 
         Raises:
-            DeviceError: switching is not configured, the device is a hub, or the machine refused.
-            BusyError: too soon after the last cycle of this port.
+            DeviceError: switching is not configured, the device is a hub, or the machine refuses to switch.
+            BusyError: the last power cycle of this port was too recent.
         """
         method = self.config.method
         if method is None:
@@ -117,7 +117,7 @@ class PortPower:
         """Cut the power of the port of ``name`` until the port is cycled; ``name`` as in ``cycle``.
 
         Raises:
-            DeviceError: the machine refused.
+            DeviceError: the machine refuses to switch.
         """
         name = await self._present_name(name)
         try:
@@ -146,7 +146,7 @@ class PortPower:
         self._cycles[topology] = (min(count + 1, longest_pause), now)
 
     async def _halves(self, name: str) -> list[str]:
-        """Return the port's attributes: to the kernel a USB 3 hub is two hubs; power is off once both ports are off."""
+        """Return the port's attributes: the kernel sees a USB 3 hub as two hubs, and both ports must be off."""
         sysfs, port = self._machine.sysfs, port_directory(name)
         peer = f"{port}/peer/disable"
         there = await self._machine.offload(lambda: sysfs.text(peer))
@@ -170,7 +170,7 @@ class PortPower:
             await self._write_all(attributes, on)
 
     async def _cycle_by_uhubctl(self, name: str) -> None:
-        """Switch off and on in two runs: ``cycle`` of uhubctl, if ended midway, would leave the port without power."""
+        """Switch off and on in two runs: an interrupted uhubctl ``cycle`` would leave the port without power."""
         try:
             await self._uhubctl(name, "off")
             await self._machine.clock.sleep(self.config.off_time)
@@ -189,7 +189,7 @@ BRAILLE: Final = frozenset(("0403:6001", "10c4:ea60", "1a86:7523"))
 
 
 def why_no_node(device: UsbDevice, kind: str, interface: int) -> str:
-    """Return in words why a plugged-in device has no node."""
+    """Return the reason why a plugged-in device has no node, as text."""
     who = f"{device.usb_id} {device.title}".rstrip()
     if interface not in device.held:
         return f"{who} has no {kind} at interface {interface}"
@@ -203,13 +203,13 @@ OPEN_TIMEOUT: Final = 2.0
 
 
 class HubNode:
-    """Resolves hub and port to the current node of one kind; never searches another place.
+    """Resolves hub and port to the current node of one kind; it never searches other places.
 
     Args:
         config: place of the device.
         machine: computer for the look-up.
         hubs: coordinator of waiting devices; None if the port does not wait.
-        role: role of the device, for ``hubs``.
+        role: the device's role, for ``hubs``.
         kind: ``tty`` or ``video4linux``.
     """
 
@@ -260,14 +260,14 @@ class HubNode:
 
 
 class HubPort:
-    """Serial port of the device at a hub's port; implements ``Port``.
+    """Serial port of the device at a hub port; implements ``Port``.
 
     Args:
         config: place of the device.
         machine: computer for the look-up.
         events: sink for reports of an adapter whose latency cannot be lowered.
         hubs: coordinator of waiting devices; None if the port does not wait.
-        power: switches the port after several short sessions, where configured.
+        power: power-cycles the port after several short sessions, if configured.
         role: the device's role.
     """
 
@@ -292,7 +292,7 @@ class HubPort:
         self._reported_slow = False
 
     async def open(self) -> Link:
-        """Wait for the device's turn, find its node, open it.
+        """Wait for the device's turn, find its node and open it.
 
         Raises:
             DeviceLostError: no device is plugged in.

@@ -1,10 +1,11 @@
-"""Read the USB tree from sysfs: names, parents, identities, nodes. Stateless.
+"""Read the USB tree from sysfs: names, parents, identities and nodes. The functions are stateless.
 
 Names are kernel names: ``usb1`` is the root hub of bus 1, ``1-2`` is on its port 2, ``1-2.3`` on port 3 of the hub
 there; ``1-2.3:1.0`` is interface 0 of that device in configuration 1, and ``1-2:1.0/1-2-port3`` is the port itself.
 
 Bus numbers follow the order of controller detection, which may change at every boot and after a controller's restart.
-Names by topology do not change: udev's ``ID_PATH`` names the controller instead, as in ``pci-0000:00:14.0-usb-0:2.3``.
+Topology names do not change: they name the controller, as udev's ``ID_PATH`` does, as in
+``pci-0000:00:14.0-usb-0:2.3``.
 """
 
 import re
@@ -70,14 +71,14 @@ class UsbDevice:
 
 @dataclass(frozen=True, slots=True)
 class TreeSnapshot:
-    """Snapshot of the whole tree."""
+    """Snapshot of the complete tree."""
 
     devices: dict[str, UsbDevice]
     over_current: dict[str, int]
     """Over-current events counted by each port since its hub appeared, by the name of a device there."""
 
     def at_present(self, name: str) -> str:
-        """See the function of this name."""
+        """See the function of the same name."""
         return _at_present(name, self.roots(), lambda place: place in self.devices)
 
     def roots(self) -> "list[Root]":
@@ -133,7 +134,7 @@ def port_of(name: str) -> int:
 
 
 def place(name: str) -> str:
-    """Return the place of ``name`` in words."""
+    """Return the place of ``name`` as text."""
     hub = parent_of(name)
     return name if hub is None else f"hub {hub} port {port_of(name)}"
 
@@ -156,12 +157,12 @@ def sort_key(name: str) -> tuple[int, ...]:
 
 
 def is_topology(name: str) -> bool:
-    """Return whether a name is a name by topology, not a kernel name."""
+    """Whether a name is a topology name rather than a kernel name."""
     return _BY_TOPOLOGY.fullmatch(name) is not None
 
 
 def topology_of(sysfs: Sysfs, name: str) -> str:
-    """Return the name by topology of a place; its kernel name if the controller is unknown."""
+    """Return the topology name of a place; its kernel name if the controller is unknown."""
     root = next((hub for hub in ancestors(name) if _ROOT.fullmatch(hub)), name)
     controller = sysfs.text(f"{DEVICES}/{root}/serial")
     if not controller:
@@ -173,8 +174,8 @@ def topology_of(sysfs: Sysfs, name: str) -> str:
 def at_present(sysfs: Sysfs, name: str) -> str:
     """Return the current kernel name of the port at a topology path.
 
-    Returns ``name`` itself if it is not a name by topology, or absent. Of the two root hubs of a USB 3 controller, the
-    hub with a device at the place is used, otherwise the USB 2 hub.
+    Returns ``name`` itself if it is not a topology name or the place is absent. Of the two root hubs of a USB 3
+    controller, the hub with a device at that place is used, or otherwise the USB 2 hub.
     """
     if not is_topology(name):
         return name
@@ -200,7 +201,7 @@ def _at_present(name: str, roots: list[Root], is_there: Callable[[str], bool]) -
 
 
 def renumbered(name: str, buses: Mapping[str, str]) -> str:
-    """Return the name of a place after a change of bus numbers.
+    """Return the name of a place after bus numbers have changed.
 
     Args:
         name: kernel name.
@@ -264,7 +265,7 @@ def _number(interface: str) -> int:
 
 
 def _nodes(sysfs: Sysfs, entry: str, interface: int) -> Iterator[Node]:
-    """Return the nodes of one interface: below ``tty`` for CDC, one folder deeper for USB serial adapters."""
+    """Yield the nodes of one interface: below ``tty`` for CDC, one folder deeper for USB serial adapters."""
     path = f"{DEVICES}/{entry}"
     for kind in ("tty", "video4linux"):
         for name in sysfs.names(f"{path}/{kind}"):

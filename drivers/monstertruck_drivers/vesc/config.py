@@ -1,4 +1,4 @@
-"""Settings of VESCs in the configuration file: the motors on one port, the servo output, the battery."""
+"""VESC settings in the configuration file: the motors on one port, the servo output, the battery."""
 
 import math
 from typing import Annotated, Literal, Self
@@ -15,7 +15,7 @@ RAD_S_PER_RPM = 2 * math.pi / 60
 
 
 class VescMotorConfig(Schema):
-    """One controller: the connected one, or one behind it on the CAN bus."""
+    """One controller: the one on the port, or one behind it on the CAN bus."""
 
     can_id: Annotated[int, Field(ge=0, le=254)] | None = None
     """CAN id; null: the connected controller"""
@@ -29,7 +29,7 @@ class VescServoConfig(Schema):
     centre: Position = 0.5
     """Position that steers straight ahead"""
     per_radian: Annotated[float, Field(gt=0, le=10)] = 1.0
-    """Change of the position per radian of servo angle"""
+    """Change in position per radian of servo angle"""
     direction: Literal[-1, 1] = -1
     """+1 if a larger position steers left, -1 if it steers right"""
     min: Position = 0.15
@@ -52,12 +52,12 @@ class VescServoConfig(Schema):
         return min(max(self.centre + self.direction * self.per_radian * angle, self.min), self.max)
 
     def angle(self, position: float) -> float:
-        """Servo angle (rad, left positive) of a position."""
+        """Servo angle (rad, left positive) for a position."""
         return (position - self.centre) * self.direction / self.per_radian
 
     @property
     def reach(self) -> tuple[float, float]:
-        """Servo angles (rad) at the limits: to the right (negative) and to the left."""
+        """Servo angles (rad) at the limits: right (negative) and left."""
         right, left = sorted(map(self.angle, (self.min, self.max)))
         return right, left
 
@@ -65,8 +65,8 @@ class VescServoConfig(Schema):
 class VescConfig(Schema):
     """VESC motor controllers on one port; motor i turns the body's shaft i.
 
-    The defaults fit a 1:10 car with a sensored motor: with a gear of 10 and wheels of 5 cm, 6000 rpm are 3.1 m/s and
-    12000 rpm/s are 6.3 m/s^2.
+    The defaults suit a 1:10 car with a sensored motor: with a gear ratio of 10 and 5 cm wheels, 6000 rpm are 3.1 m/s
+    and 12000 rpm/s are 6.3 m/s^2.
     """
 
     kind: Literal["vesc"] = "vesc"
@@ -96,11 +96,11 @@ class VescConfig(Schema):
     battery_rate: Annotated[float, Field(gt=0, le=50)] = 10.0
     """Battery readings per second"""
     rate: Annotated[float, Field(ge=10, le=100)] = 40.0
-    """Exchanges per second with every controller; at 115200 baud one takes 9 ms"""
+    """Exchanges per second with every controller; at 115200 baud, an exchange takes 9 ms"""
     answer_timeout: Annotated[float, Field(gt=0, le=0.2)] = 0.03
     """Timeout of an answer (s)"""
     command_timeout: Seconds = 0.25
-    """Maximum age of the latest command (s); the driver then brakes the motors"""
+    """Maximum age of the latest command (s), after which the driver brakes the motors"""
     watchdog: Annotated[float, Field(ge=0.05, le=1.0)] = 0.1
     """Watchdog time of the controller (s): it brakes without a set-point; the driver writes it at every start"""
 
@@ -111,7 +111,7 @@ class VescConfig(Schema):
 
     @property
     def motor_limits(self) -> MotorLimits:
-        """Limits of a motor."""
+        """Motor limits."""
         return MotorLimits(
             self.max_motor_rpm * RAD_S_PER_RPM,
             self.deceleration_rpm_s * RAD_S_PER_RPM,
@@ -120,7 +120,7 @@ class VescConfig(Schema):
 
     @property
     def steering_outputs(self) -> SteeringOutputs | None:
-        """Servo of the front axle; the rear one is fixed."""
+        """Output for the front axle servo; the rear axle is fixed."""
         if self.servo is None:
             return None
         return SteeringOutputs((self.servo.reach, (0.0, 0.0)), self.servo.dead_time, self.servo.lag)

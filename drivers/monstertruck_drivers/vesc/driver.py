@@ -1,10 +1,10 @@
-"""Driver of VESCs on one port: ``cmd/drive*`` and ``cmd/steering`` in; feedback of motors, servo and battery out.
+"""Driver for VESCs on one port: ``cmd/drive*`` and ``cmd/steering`` in; motor, servo and battery feedback out.
 
 One exchange per cycle with every controller sends its set-point and receives its values. A quick stop is a brake
-current, sent again in every cycle; a disabled motor coasts.
+current, repeated in every cycle; a disabled motor coasts.
 
 Every set-point resets the controller's watchdog, which is set at the start of a session and brakes when the host is
-silent. A session brakes the motors at its start, and at its end until they rest; then they coast.
+silent. A session brakes the motors at its start, and again at its end until they are at rest; then they coast.
 """
 
 import contextlib
@@ -38,7 +38,7 @@ from monstertruck_schemas.sensor import Battery, DriveFeedback, DriveMode, Steer
 
 
 class VescSetpoint(NamedTuple):
-    """Set-points of the motors."""
+    """Motor set-points."""
 
     mode: DriveMode
     """DISABLED, QUICK_STOP or ENABLED."""
@@ -47,11 +47,11 @@ class VescSetpoint(NamedTuple):
 
 
 def setpoint_of(commands: Sequence[DriveCommand | None], now: int, config: VescConfig) -> VescSetpoint:
-    """Combine the latest commands of all shafts into set-points; stale commands brake.
+    """Combine the latest commands of all shafts into set-points; a stale command brakes its motor.
 
     Args:
-        commands: latest command of every shaft, if any.
-        now: time (ns).
+        commands: latest command for every shaft, if any.
+        now: current time (ns).
         config: limits and timeouts.
     """
     mode, known = requested(commands, now, config.command_timeout)
@@ -73,19 +73,19 @@ def payload_of(setpoint: VescSetpoint, i: int, config: VescConfig) -> bytes:
 
 
 class VescDriver(MotorBoard[VescConfig, VescSession]):
-    """Service of all motors on one port, with the servo output and the battery's voltage; see ``MotorBoard``.
+    """Drive service for all motors on one port, with servo output and battery voltage; see ``MotorBoard``.
 
     Args:
         config: see ``VescConfig``.
-        port: port of the first controller.
+        port: the first controller's port.
         clock: time.
         steering_commands: ``cmd/steering``.
-        drive: feedback of the first motor, whose current explains the battery's sag.
+        drive: feedback from the first motor, whose current explains the battery sag.
         steering: position sent to the servo, as an angle; None if another device steers.
         battery: pack voltage; None if another device measures the battery.
-        events: identity, restarts, faults.
-        name: name of the service.
-        ends: topics of the shafts.
+        events: identity, restarts and faults.
+        name: service name.
+        ends: the shafts' topics.
     """
 
     def __init__(
@@ -124,7 +124,8 @@ class VescDriver(MotorBoard[VescConfig, VescSession]):
         """See the base class.
 
         Raises:
-            DeviceMismatchError: no controller at a CAN id, old firmware, or a watchdog that cannot be set.
+            DeviceMismatchError: no controller answers at a CAN id, the firmware is too old, or the watchdog cannot be
+                set.
             WrongDeviceError: another device answers.
         """
         config = self._config
@@ -183,7 +184,7 @@ class VescDriver(MotorBoard[VescConfig, VescSession]):
         """Accumulate the motor's steps.
 
         Raises:
-            DeviceRestartedError: the controller restarted at 0.
+            DeviceRestartedError: the controller restarted and counts from 0.
         """
         last = self._last[i]
         self._last[i] = values
@@ -231,7 +232,7 @@ class VescDriver(MotorBoard[VescConfig, VescSession]):
         out.put(SteeringFeedback(stamp=stamp, received=received, seq=out.next_seq(), front=angle, rear=0.0))
 
     async def _make_safe(self, session: VescSession) -> None:
-        """Brake until the motors rest, then let them coast; after the deadline the watchdog continues braking."""
+        """Brake until the motors are at rest, then let them coast; after the deadline, the watchdog brakes."""
         config = self._config
         rest = config.standstill_rpm * config.pole_pairs
         with contextlib.suppress(DeviceLostError):

@@ -1,10 +1,10 @@
-"""Device side of VESCs: the connected controller and the controllers behind it on its CAN bus.
+"""Emulated VESCs: the connected controller and the controllers behind it on its CAN bus.
 
 Real VESCs send nothing without a request, and do not answer damaged packets, unknown packets or set-points. When
 set-points stop, the watchdog applies its brake current; the factory setting is 0, so the motor coasts freely. The speed
-controller gives no torque below its minimum speed. A fault releases the motor for half a second. Answers from behind
-CAN do not name their sender. Temporary settings and counters are lost at power-up. The servo output keeps its latest
-position.
+controller gives no torque below its minimum speed. A fault releases the motor for half a second. Answers from
+controllers on the CAN bus do not name their sender. Temporary settings and counters are lost at power-up. The servo
+output keeps its latest position.
 """
 
 import asyncio
@@ -50,11 +50,11 @@ class EmulatedController:
 
     Args:
         now: clock.
-        plant: load of the motor.
+        plant: motor load.
         settings: driver settings: pole pairs, braking.
-        can_id: CAN id of this controller.
-        signals: signals of the whole device.
-        place: number of the motor, from 1, for the signals' names.
+        can_id: this controller's CAN id.
+        signals: signals of the complete device.
+        place: motor number, counted from 1, for the signal names.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class EmulatedController:
         self._turn(0.0 if amperes > 0 else None, deceleration or 1.0)
 
     def drive(self, amperes: float) -> None:
-        """Drive with a current; 0 lets it coast."""
+        """Drive with a current; 0 lets the motor coast."""
         share = abs(amperes) / self._config.brake_current
         free = NO_LOAD_PER_VOLT * self._plant.reading(self._clock.now()).supply_v
         target = None if amperes == 0.0 else (free if amperes > 0 else -free)
@@ -141,7 +141,7 @@ class EmulatedController:
         return True
 
     def values(self) -> MotorValues:
-        """Current values as they are sent."""
+        """Current values as sent to the host."""
         now, report, n = self._clock.now(), self._signals.report, self._place
         reading, turns = self._plant.reading(now), self._turns(now)
         self._travel += abs(turns - self._seen)
@@ -179,14 +179,14 @@ class VescEmulator(FaultyDevice):
     """All controllers on one port.
 
     Faults (``inject``): ``silent on|off`` (no answers), ``late SECONDS [COUNT]`` (late answers), ``noise COUNT`` (the
-    next COUNT answers have a wrong byte), ``reset`` (all restart), ``fault CODE [MOTOR]`` (0 ends it),
-    ``no_store on|off`` (firmware without temporary settings), ``firmware MAJOR MINOR``, ``runaway`` (all disobey,
-    see ``DisobedientMotor``).
+    next COUNT answers contain a wrong byte), ``reset`` (all restart), ``fault CODE [MOTOR]`` (0 ends it), ``no_store
+    on|off`` (firmware without temporary settings), ``firmware MAJOR MINOR``, ``runaway`` (all disobey, see
+    ``DisobedientMotor``).
 
     Args:
         clock: time.
-        plants: loads of the motors; missing ones are replaced by free motors.
-        servos: steering servos; the output moves the servo on channel 0. None: not connected.
+        plants: motor loads; missing entries are replaced by unloaded motors.
+        servos: steering servos; the output moves the servo on channel 0. None if not connected.
         settings: list of controllers.
         own_id: CAN id of the connected controller.
     """
@@ -314,7 +314,7 @@ class VescEmulator(FaultyDevice):
         self.signals.order("servo", position, move)
 
     def _obey(self, controller: EmulatedController, payload: bytes) -> bytes | None:
-        """Execute a payload; return its answer, if it has one."""
+        """Execute a payload; return the answer, if any."""
         match payload[0]:
             case PacketId.FW_VERSION:
                 serial = bytes((controller.can_id,)) * 12

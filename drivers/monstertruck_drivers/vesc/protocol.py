@@ -1,9 +1,9 @@
-"""Packets of the VESC; pure codec that needs only the standard library, as the stop script requires.
+"""VESC packets: a codec that needs only the standard library, so that the stop script can use it.
 
 A packet is a start byte, the length of its payload, the payload, a CRC of the payload (polynomial 0x1021, initial value
-0, high byte first) and a stop byte. The start byte 2 has one length byte, 3 has two. The first byte of the payload
-names the packet; numbers are big-endian and scaled. Source: VESC firmware (vedderb/bldc), ``comm/packet.c`` (framing),
-``comm/commands.c`` (payloads), ``datatypes.h`` (packet and fault codes), ``confgenerator.c`` (settings).
+0, high byte first) and a stop byte. Start byte 2 is followed by one length byte, start byte 3 by two. The first byte of
+the payload names the packet; numbers are big-endian and scaled. Source: VESC firmware (vedderb/bldc), ``comm/packet.c``
+(framing), ``comm/commands.c`` (payloads), ``datatypes.h`` (packet and fault codes), ``confgenerator.c`` (settings).
 """
 
 import binascii
@@ -43,7 +43,7 @@ class PacketId(IntEnum):
 
 
 class PacketError(ValueError):
-    """Malformed or unexpected payload."""
+    """A payload is malformed or unexpected."""
 
 
 def frame(payload: bytes) -> bytes:
@@ -59,7 +59,7 @@ def frame(payload: bytes) -> bytes:
 
 
 class Deframer:
-    """Splits a byte stream, in chunks of any size, into payloads; counts the bytes outside of packets."""
+    """Splits a byte stream, in chunks of any size, into payloads; counts the bytes outside packets."""
 
     def __init__(self) -> None:
         self.bad = 0
@@ -90,7 +90,7 @@ class Deframer:
         self._rest.clear()
 
     def _head(self) -> int:
-        """Length of start byte and length bytes."""
+        """Number of start and length bytes."""
         return self._rest[0]
 
     def _size(self) -> int | None:
@@ -145,7 +145,7 @@ def set_servo(position: float) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class FirmwareIdentity:
-    """Answer to ``FW_VERSION``."""
+    """Reply to ``FW_VERSION``."""
 
     major: int
     minor: int
@@ -158,7 +158,7 @@ class FirmwareIdentity:
         """Parse a payload.
 
         Raises:
-            PacketError: not a firmware version.
+            PacketError: the payload is not a firmware version.
         """
         name, end, rest = payload[3:].partition(b"\0")
         if payload[:1] != bytes((PacketId.FW_VERSION,)) or not end or len(rest) < 12:
@@ -179,7 +179,7 @@ _LATER: Final = struct.Struct(">hhhiiB")
 
 @dataclass(frozen=True, slots=True)
 class MotorValues:
-    """Answer to ``GET_VALUES``: the fields used, in its units and the controller's sign."""
+    """Answer to ``GET_VALUES``: the fields used, in the packet's units and with the controller's sign."""
 
     motor_current: float
     """Motor current (A)."""
@@ -205,7 +205,7 @@ class MotorValues:
         """Parse a payload; later firmware may append fields.
 
         Raises:
-            PacketError: not the values of a motor.
+            PacketError: the payload does not contain motor values.
         """
         if len(payload) < _VALUES.size or payload[0] != PacketId.GET_VALUES:
             raise PacketError(f"{payload[:20].hex(' ')}: expected values of a motor, {_VALUES.size} bytes or more")
@@ -225,7 +225,7 @@ class MotorValues:
         )
 
     def payload(self) -> bytes:
-        """Encode the answer; unused fields read 0."""
+        """Encode the answer; unused fields are 0."""
         return _VALUES.pack(
             PacketId.GET_VALUES,
             round(10 * self.celsius),
@@ -253,7 +253,7 @@ _WATCHDOG_AT: Final = 6
 
 @dataclass(frozen=True, slots=True)
 class WatchdogSetting:
-    """Watchdog of the controller: it brakes without set-points."""
+    """Controller watchdog, which brakes when set-points stop."""
 
     milliseconds: int
     """Time without a set-point until the watchdog acts (ms); 0 = never."""
@@ -265,14 +265,14 @@ class WatchdogSetting:
         """Parse an answer to ``GET_APPCONF``.
 
         Raises:
-            PacketError: not the settings.
+            PacketError: the payload does not contain the settings.
         """
         if len(settings) < _WATCHDOG_AT + _WATCHDOG.size or settings[0] != PacketId.GET_APPCONF:
             raise PacketError(f"{settings[:20].hex(' ')}: expected settings")
         return cls(*_WATCHDOG.unpack_from(settings, _WATCHDOG_AT))
 
     def applied(self, settings: bytes) -> bytes:
-        """Return a payload that writes this watchdog into the settings read, until the next power-up."""
+        """Return a payload that writes these settings with this watchdog, valid until the next power-up."""
         end = _WATCHDOG_AT + _WATCHDOG.size
         new = _WATCHDOG.pack(self.milliseconds, self.brake_current)
         return bytes((PacketId.SET_APPCONF_NO_STORE,)) + settings[1:_WATCHDOG_AT] + new + settings[end:]
@@ -302,5 +302,5 @@ def step(before: int, now: int) -> int:
 
 
 def stop_frames(brake: float, can_id: int | None) -> tuple[bytes, bytes]:
-    """Packets that brake a motor with a current (A), and that let it coast."""
+    """Return two packets: one brakes a motor with a current (A), the other lets it coast."""
     return frame(forwarded(can_id, set_brake(brake))), frame(forwarded(can_id, set_current(0.0)))

@@ -1,4 +1,4 @@
-"""Requests and answers of VESCs over one open link; shared by the driver and `identify`."""
+"""Requests to VESCs and their answers over one open link; shared by the driver and `identify`."""
 
 from collections.abc import Callable
 from typing import Final
@@ -28,12 +28,12 @@ SETTINGS_TIMEOUT: Final = 0.5
 
 
 class VescSession:
-    """One session. Packets carry no sequence number: the kind, and for values also the CAN id, identifies an answer.
+    """One session. Packets carry no sequence number: an answer is identified by its kind and, for values, the CAN id.
 
     Args:
         link: open link.
         clock: time.
-        timeout: timeout of an answer (s).
+        timeout: maximum time to wait for an answer (s).
     """
 
     def __init__(self, link: Link, clock: Clock, timeout: float) -> None:
@@ -50,7 +50,7 @@ class VescSession:
         """Send a payload that has no answer.
 
         Raises:
-            DeviceLostError: unplugged.
+            DeviceLostError: the controller was unplugged.
         """
         self._link.write(frame(forwarded(can_id, payload)))
 
@@ -58,10 +58,10 @@ class VescSession:
         """Identify a controller.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: silence.
+            DeviceLostError: the controller was unplugged.
+            DeviceTimeoutError: the controller is silent.
             WrongDeviceError: another device answers.
-            DeviceMismatchError: no controller at the CAN id, or a firmware that is too old.
+            DeviceMismatchError: no controller answers at the CAN id, or its firmware is too old.
         """
         who = f"{self._link.name}: "
         try:
@@ -84,9 +84,9 @@ class VescSession:
         """Return a motor's values.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: no answer within the timeout.
-            ProtocolError: a malformed answer.
+            DeviceLostError: the controller was unplugged.
+            DeviceTimeoutError: the answer did not arrive within the timeout.
+            ProtocolError: the answer is malformed.
         """
         until_id = None if can_id is None else lambda payload: MotorValues.of(payload).controller_id == can_id
         try:
@@ -100,13 +100,13 @@ class VescSession:
         """Make a controller brake by itself when set-points stop; its flash is not written.
 
         Returns:
-            Whether the controller had other settings.
+            Whether the controller's settings differed before.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: no answer within the timeout.
+            DeviceLostError: the controller was unplugged.
+            DeviceTimeoutError: the answer did not arrive within the timeout.
             DeviceMismatchError: the controller does not apply the setting.
-            ProtocolError: a malformed answer.
+            ProtocolError: the answer is malformed.
         """
         settings = await self._settings(can_id)
         if _equal(found := self._watchdog(settings), wanted):
@@ -174,11 +174,11 @@ async def identify(link: Link, clock: Clock, settings: VescConfig) -> dict[str, 
     """Read identity and values of every configured controller, without moving or changing anything.
 
     Returns:
-        JSON-able: for each of ``motors`` its ``can_id``, ``hardware``, ``firmware``, ``serial``, ``erpm``,
+        JSON-compatible dict: for each of ``motors`` its ``can_id``, ``hardware``, ``firmware``, ``serial``, ``erpm``,
         ``tachometer``, ``volts``, ``fault``.
 
     Raises:
-        DeviceError: see the driver's ``run``.
+        DeviceError: the same errors as from the driver's ``run``.
     """
     session = VescSession(link, clock, settings.answer_timeout)
     found = []

@@ -31,13 +31,13 @@ TABLES_SEGMENT: Final = b"\xff\xc4" + (2 + len(_TABLES)).to_bytes(2, "big") + _T
 def complete(data: bytes) -> bytes:
     """Return the picture from its FF D8 to its FF D9, with Huffman tables.
 
-    The headers are parsed, the compressed data is not: a flipped bit there only changes the picture.
+    Only the headers are parsed, because a flipped bit in the compressed data merely alters the picture.
 
     Args:
-        data: bytes from the camera; zeros after the picture are cut off.
+        data: bytes from the camera; trailing zeros are removed.
 
     Raises:
-        ValueError: truncated, or not a JPEG; the text names the position of the error.
+        ValueError: the picture is truncated or not a JPEG; the message names the position of the error.
     """
     end = data.rfind(END) + len(END)
     if end < len(END) or data[end:].strip(b"\0"):
@@ -68,7 +68,7 @@ OLDEST: Final = SECOND
 
 
 class CameraSettings(Protocol):
-    """Settings that every camera has; see ``WebcamConfig``."""
+    """Settings common to all cameras; see ``WebcamConfig``."""
 
     @property
     def width(self) -> int: ...  # noqa: D102
@@ -90,9 +90,9 @@ class WebcamDriver:
     Args:
         config: mode and watchdog.
         source: the camera: ``V4l2Source`` or ``RenderedSource``.
-        clock: time; a real camera's stamps are times of CLOCK_MONOTONIC, as on the wall clock.
+        clock: time source; a real camera's stamps are CLOCK_MONOTONIC times, like those of the real clock.
         out: pictures.
-        events: deviating modes, rejected pictures, unused stamps.
+        events: deviating modes, rejected pictures and unused stamps.
         name: service name.
     """
 
@@ -117,15 +117,15 @@ class WebcamDriver:
         self._stamp = -OLDEST
 
     async def run(self, ready: Ready) -> None:
-        """Serve one session; it is ready after the first complete picture.
+        """Serve one session, which is ready after the first complete picture.
 
         Raises:
-            DeviceLostError: no camera, or unplugged.
-            PortBusyError: another program streams from it.
-            DeviceMismatchError: it has no motion JPEG, or refuses the mode.
-            DeviceFaultError: no bandwidth left on its hub.
-            DeviceTimeoutError: no picture within ``watchdog``.
-            ProtocolError: pictures, but no complete one within that time.
+            DeviceLostError: there is no camera, or it was unplugged.
+            PortBusyError: another program is streaming from the camera.
+            DeviceMismatchError: the camera does not offer motion JPEG or refuses the mode.
+            DeviceFaultError: the camera's hub has no bandwidth left.
+            DeviceTimeoutError: no picture arrived within ``watchdog``.
+            ProtocolError: pictures arrived, but no complete one within that time.
         """
         config = self._config
         wanted = Mode(config.width, config.height, config.rate)
@@ -181,7 +181,7 @@ class WebcamDriver:
         return True
 
     def _believed(self, stamp: int | None, received: int) -> int:
-        """Return the camera's stamp if it is plausible, otherwise the time of arrival."""
+        """Return the camera's stamp if it is plausible, otherwise the arrival time."""
         if stamp is None:
             return received
         possible = max(self._stamp, received - OLDEST) <= stamp <= received

@@ -21,7 +21,7 @@ from monstertruck_runtime.threads import Offload, in_thread
 
 
 def jpeg(picture: NDArray[np.uint8], counter: int) -> bytes:
-    """Encode a picture of shape (height, width, 3) as JPEG, with ``counter`` in its upper left corner."""
+    """Encode a picture of shape (height, width, 3) as JPEG, with ``counter`` encoded in its upper left corner."""
     image = Image.fromarray(picture)
     draw = ImageDraw.Draw(image)
     text = f"{counter:06d}"
@@ -53,18 +53,18 @@ REFUSALS: Final = {"EINVAL": errno.EINVAL, "EBUSY": errno.EBUSY, "ENOSPC": errno
 class WebcamEmulator(FaultyDevice):
     """Camera that streams rendered JPEGs while a host requests them.
 
-    The loop reads the world's state; ``offload`` runs drawing and compression.
+    The loop reads the world's state; ``offload`` runs rendering and compression.
 
     Faults (``inject``): ``drop N`` (pictures are counted, but not sent), ``corrupt N`` (start marker overwritten),
     ``truncate N`` (the second half is missing), ``bare on|off`` (no Huffman tables), ``jump SECONDS`` (added to all
-    stamps from now on), ``stuck on|off`` (no stream and no answers), ``refuse EINVAL|EBUSY|ENOSPC|off`` (at the
-    next openings), ``vanish [SECONDS]`` (leaves USB while streaming, and returns).
+    later stamps), ``stuck on|off`` (no stream and no answers), ``refuse EINVAL|EBUSY|ENOSPC|off`` (at the next
+    openings), ``vanish [SECONDS]`` (the camera leaves USB while streaming, and returns).
 
     Args:
         clock: time.
-        view: source of the pictures.
-        offload: runs the drawing: in a thread, or ``inline`` on the virtual clock.
-        usb: port of the camera, for ``vanish``.
+        view: image source.
+        offload: runs the rendering in a thread, or ``inline`` with the virtual clock.
+        usb: the camera's port, for ``vanish``.
     """
 
     def __init__(
@@ -192,5 +192,5 @@ class WebcamEmulator(FaultyDevice):
 
 
 def emulated(setup: EmulatorSetup) -> WebcamEmulator:
-    """Create the camera of a simulated truck."""
+    """Create a simulated truck's camera."""
     return WebcamEmulator(setup.clock, setup.physics.view, offload=setup.offload, usb=setup.port)

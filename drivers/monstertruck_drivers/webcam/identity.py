@@ -20,8 +20,8 @@ async def identify(
     """Query every node that matches ``pattern``, without streaming.
 
     Returns:
-        JSON-able: ``nodes``: path, driver, card, bus, whether it captures, pixel formats, and the sizes and rates of
-        motion JPEG; or the error of the query.
+        JSON-compatible dict: ``nodes``, each with path, driver, card, bus, whether it captures, pixel formats, and the
+        sizes and rates for motion JPEG, or with the query error.
     """
     system = kernel or Kernel()
     return await offload(lambda: {"nodes": [_describe(path, system) for path in system.nodes(pattern)]})

@@ -1,7 +1,7 @@
-"""Packets of an emulated camera: the answers and pictures that the kernel delivers for a real camera.
+"""Packets from an emulated camera: the answers and pictures that the kernel would deliver for a real camera.
 
-Host to camera: lines ``OPEN <width> <height> <rate>`` and ``CLOSE``. Camera to host: packets of a header with its
-own CRC-32 and a payload, little-endian.
+Host to camera: lines ``OPEN <width> <height> <rate>`` and ``CLOSE``. Camera to host: little-endian packets of a header
+with its own CRC-32 and a payload.
 """
 
 import struct
@@ -55,7 +55,7 @@ def decode_mode(payload: bytes) -> Mode:
     """Decode the payload of ``GRANTED``.
 
     Raises:
-        ProtocolError: wrong length.
+        ProtocolError: the length is wrong.
     """
     if len(payload) != _MODE.size:
         raise ProtocolError(f"mode needs {_MODE.size} bytes, got {len(payload)}")
@@ -63,7 +63,7 @@ def decode_mode(payload: bytes) -> Mode:
 
 
 class PacketParser:
-    """Extracts packets from bytes in chunks of any size; after lost bytes it resumes at the next valid header."""
+    """Extracts packets from bytes in chunks of any size; after lost bytes, it resumes at the next valid header."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()

@@ -1,7 +1,7 @@
-"""Structures and requests of Video4Linux2 that a motion-JPEG camera needs.
+"""Video4Linux2 structures and requests for a motion-JPEG camera.
 
-``struct`` lays the structures out with native sizes and alignment, as in the kernel's header.
-Source: kernel documentation, userspace-api/media/v4l, and include/uapi/linux/videodev2.h.
+``struct`` uses native sizes and alignment, as in the kernel header. Source: kernel documentation,
+userspace-api/media/v4l, and include/uapi/linux/videodev2.h.
 """
 
 import struct
@@ -107,12 +107,12 @@ class Filled:
 
 
 def buffer(index: int) -> bytearray:
-    """Argument of QUERYBUF, QBUF and DQBUF."""
+    """Return the argument for QUERYBUF, QBUF and DQBUF."""
     return bytearray(BUFFER.pack(index, CAPTURE, *([0] * 5), *([0] * 6), bytes(4), 0, MMAP, 0, 0, 0, 0))
 
 
 def format_request(mode: Mode) -> bytearray:
-    """Argument of S_FMT for motion JPEG."""
+    """Return the argument of S_FMT for motion JPEG."""
     return bytearray(FORMAT.pack(CAPTURE, mode.width, mode.height, MJPG, 0, *([0] * 8)))  # any field order
 
 
@@ -123,12 +123,12 @@ def format_granted(data: Bytes) -> tuple[int, int, int]:
 
 
 def rate_request(rate: float) -> bytearray:
-    """Argument of S_PARM."""
+    """Return the argument of S_PARM."""
     return bytearray(STREAM_PARAMETERS.pack(CAPTURE, 0, 0, 1000, round(rate * 1000), 0))
 
 
 def rate_granted(data: Bytes, asked: float) -> float:
-    """Rate that the driver granted; ``asked`` if the rate cannot be set."""
+    """Rate that the driver granted, or ``asked`` if the rate cannot be set."""
     _, _, _, numerator, denominator, _ = STREAM_PARAMETERS.unpack(data)
     return denominator / numerator if numerator and denominator else asked
 

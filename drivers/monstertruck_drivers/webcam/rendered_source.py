@@ -16,7 +16,7 @@ MOST: Final = BUFFER_LIMIT // 2
 
 
 class RenderedSource:
-    """Camera whose ``WebcamEmulator`` runs at the other end of ``port``, in this process or another one.
+    """Camera whose ``WebcamEmulator`` runs at the other end of ``port``, in this process or in another.
 
     Args:
         port: memory port or pty.
@@ -29,7 +29,7 @@ class RenderedSource:
         self._clock = clock
 
     async def open(self, mode: Mode, buffers: int) -> "RenderedStream":
-        """Start the camera, see ``FrameSource``."""
+        """Start the camera; see ``FrameSource``."""
         link = await self._port.open()
         parser = PacketParser()
         try:
@@ -45,7 +45,7 @@ class RenderedSource:
             raise
 
     async def _answer(self, link: Link, parser: PacketParser) -> Mode:
-        """Wait for the answer; pictures of an earlier session are dropped."""
+        """Wait for the answer; pictures from an earlier session are dropped."""
         while True:
             for packet in parser.feed(await link.exactly(min(parser.missing, MOST))):
                 if packet.kind is PacketKind.GRANTED:
@@ -56,7 +56,7 @@ class RenderedSource:
 
 
 class RenderedStream:
-    """Stream of an emulated camera."""
+    """Stream from an emulated camera."""
 
     def __init__(self, link: Link, parser: PacketParser, mode: Mode) -> None:
         self.mode = mode
@@ -64,7 +64,7 @@ class RenderedStream:
         self._parser = parser
 
     async def next(self) -> CameraFrame:
-        """Wait for a picture, see ``FrameStream``."""
+        """Wait for a picture; see ``FrameStream``."""
         picture: CameraPacket | None = None
         while picture is None:
             for packet in self._parser.feed(await self._link.read(least=min(self._parser.missing, MOST))):
@@ -88,7 +88,7 @@ class PathSource:
     """Camera at a path; each opening checks whether the path leads to a pty, which only an emulator serves.
 
     Args:
-        path: node, symlink or glob pattern, see ``V4l2Source``.
+        path: node, symlink or glob pattern; see ``V4l2Source``.
         clock: time.
     """
 
@@ -97,7 +97,7 @@ class PathSource:
         self._clock = clock
 
     async def open(self, mode: Mode, buffers: int) -> FrameStream:
-        """Start the camera, see ``FrameSource``."""
+        """Start the camera; see ``FrameSource``."""
         return await self._present().open(mode, buffers)
 
     def _present(self) -> FrameSource:

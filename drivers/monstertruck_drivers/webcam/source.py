@@ -16,7 +16,7 @@ from monstertruck_runtime.errors import (
 
 @dataclass(frozen=True, slots=True)
 class Mode:
-    """Settings requested of a camera, or granted by it."""
+    """Settings requested from a camera or granted by it."""
 
     width: int
     height: int
@@ -29,7 +29,7 @@ class Mode:
 
 @dataclass(frozen=True, slots=True)
 class CameraFrame:
-    """One picture as the camera sent it, still unchecked."""
+    """One unchecked picture as sent by the camera."""
 
     stamp: int | None
     """Time of exposure on CLOCK_MONOTONIC (ns); None: unknown."""
@@ -41,7 +41,7 @@ class CameraFrame:
 
 
 class FrameStream(Protocol):
-    """Stream of a camera."""
+    """Stream from a camera."""
 
     mode: Mode
     """Granted mode; it may differ from the requested one."""
@@ -50,8 +50,8 @@ class FrameStream(Protocol):
         """Wait for a picture newer than the last one; older pictures are dropped.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceError: the camera failed otherwise.
+            DeviceLostError: the camera was unplugged.
+            DeviceError: the camera failed in another way.
         """
 
     async def __aenter__(self) -> Self:
@@ -71,9 +71,9 @@ class FrameSource(Protocol):
 
         Raises:
             DeviceLostError: no camera is plugged in.
-            PortBusyError: another program streams from it.
-            DeviceMismatchError: it has no motion JPEG, or refuses the mode.
-            DeviceFaultError: no bandwidth left on its hub.
+            PortBusyError: another program is streaming from the camera.
+            DeviceMismatchError: the camera does not offer motion JPEG or refuses the mode.
+            DeviceFaultError: the camera's hub has no bandwidth left.
             DeviceError: any other failure.
         """
 

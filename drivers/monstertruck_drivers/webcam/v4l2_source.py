@@ -1,4 +1,4 @@
-"""Real camera: finds its node, sets it up, and reads pictures from the kernel's buffers."""
+"""Real camera: finds its node, configures it, and reads pictures from kernel buffers."""
 
 import asyncio
 import contextlib
@@ -27,7 +27,7 @@ class Kernel:
     """System calls for a camera; each of them may block."""
 
     def nodes(self, pattern: str) -> list[str]:
-        """Existing device nodes that match a glob pattern, video2 before video10."""
+        """Return the device nodes that match a glob pattern, in numeric order (video2 before video10)."""
         return sorted(map(str, Path("/").glob(pattern.lstrip("/"))), key=lambda path: (len(path), path))
 
     def open(self, path: str) -> int:
@@ -66,7 +66,7 @@ class V4l2Source:
         self._offload = offload
 
     async def open(self, mode: Mode, buffers: int) -> "V4l2Stream":
-        """Start the camera, see ``FrameSource``."""
+        """Start the camera; see ``FrameSource``."""
         starting = _Starting(self.name, self._kernel, mode, buffers)
         try:
             return V4l2Stream(await self._offload(starting.run), self._offload)
@@ -102,10 +102,10 @@ class Camera:
         return camera
 
     def take(self) -> CameraFrame | None:
-        """Return the oldest picture that is ready, if any; its buffer returns to the kernel.
+        """Return the oldest picture that is ready, if any, and give its buffer back to the kernel.
 
         Raises:
-            DeviceLostError: unplugged.
+            DeviceLostError: the camera was unplugged.
             DeviceError: streaming failed.
         """
         argument = v4l2.buffer(0)
@@ -158,7 +158,7 @@ class Camera:
 
 
 class _Starting:
-    """Start of a camera that the caller may abandon before the kernel has completed it.
+    """A camera start that the caller may abandon before the kernel has completed it.
 
     Args:
         pattern: see ``V4l2Source``.
@@ -191,7 +191,7 @@ class _Starting:
 
 
 class V4l2Stream:
-    """Stream of a real camera."""
+    """Stream from a real camera."""
 
     def __init__(self, camera: Camera, offload: Offload) -> None:
         self.mode = camera.mode
@@ -204,7 +204,7 @@ class V4l2Stream:
         self._loop.add_reader(camera.fd, self._readable)
 
     async def next(self) -> CameraFrame:
-        """Wait for a picture, see ``FrameStream``."""
+        """Wait for a picture; see ``FrameStream``."""
         await self._news.wait()
         if self._error is not None:
             raise self._error
@@ -240,7 +240,7 @@ class V4l2Stream:
 
 
 def find_node(pattern: str, kernel: Kernel) -> str:
-    """Return the first node of ``pattern`` that captures motion JPEG.
+    """Return the first node matching ``pattern`` that captures motion JPEG.
 
     Raises:
         DeviceLostError: there is no such node.
@@ -290,7 +290,7 @@ def enumerate_formats(fd: int, kernel: Kernel) -> list[int]:
 
 
 def enumerate_modes(fd: int, kernel: Kernel) -> list[Mode]:
-    """Return the discrete sizes and rates of motion JPEG; stepwise ones are omitted."""
+    """Return the discrete sizes and rates for motion JPEG; stepwise ranges are omitted."""
     modes = []
     for _, _, size_kind, width, height, *_ in _enumerate(fd, kernel, v4l2.ENUM_FRAMESIZES, v4l2.FRAME_SIZE, v4l2.MJPG):
         if size_kind != v4l2.DISCRETE:
@@ -305,7 +305,7 @@ def enumerate_modes(fd: int, kernel: Kernel) -> list[Mode]:
 
 
 def _enumerate(fd: int, kernel: Kernel, request: int, layout: struct.Struct, *key: int) -> list[tuple[Any, ...]]:
-    """Return the rows of an enumeration; each request contains index and key and returns the whole structure."""
+    """Return the rows of an enumeration; each request contains the index and key and returns the complete structure."""
     head = struct.Struct(f"@{1 + len(key)}I")
     rows: list[tuple[Any, ...]] = []
     while len(rows) < 256:  # maximum number of rows: a broken driver may never report the end
@@ -323,7 +323,7 @@ def _enumerate(fd: int, kernel: Kernel, request: int, layout: struct.Struct, *ke
 
 @contextmanager
 def _doing(path: str, what: str) -> Iterator[None]:
-    """Convert the kernel's errors into ``DeviceError``; "nothing there yet" is not an error."""
+    """Convert kernel errors into ``DeviceError``; EAGAIN ("no data yet") is not an error."""
     try:
         yield
     except BlockingIOError:

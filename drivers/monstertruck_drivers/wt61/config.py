@@ -1,4 +1,4 @@
-"""Settings of the WT61."""
+"""Settings for the WT61."""
 
 from typing import Annotated, Literal
 
@@ -9,7 +9,7 @@ from monstertruck_schemas.base import Schema
 
 
 class Wt61Config(Schema):
-    """WitMotion WT61: three gyroscopes, three accelerometers."""
+    """WitMotion WT61: three gyroscopes and three accelerometers."""
 
     kind: Literal["wt61"] = "wt61"
     average: Annotated[int, Field(ge=1, le=20)] = 2

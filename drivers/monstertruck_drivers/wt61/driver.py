@@ -35,7 +35,7 @@ class Wt61Session:
         self._acceleration: Wt61Packet | None = None
 
     async def receive(self, within: float) -> list[ImuSample]:
-        """Return samples that became complete; raises the errors of ``DeviceStream.receive``."""
+        """Return the completed samples; raises the same errors as ``DeviceStream.receive``."""
         return await self._stream.receive(within)
 
     def _samples(self, packets: list[Wt61Packet]) -> list[ImuSample]:
@@ -49,12 +49,12 @@ class Wt61Session:
         return samples
 
     async def start(self) -> list[ImuSample]:
-        """Wait for packets of a unit, which may be in standby.
+        """Wait for packets from a unit that may be in standby.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: silence.
-            WrongDeviceError: bytes, but no packet of a WT61.
+            DeviceLostError: the unit was unplugged.
+            DeviceTimeoutError: the unit is silent.
+            WrongDeviceError: bytes arrive, but no WT61 packet.
         """
         for remedy in (b"", TOGGLE_SLEEP):
             if remedy:
@@ -71,12 +71,12 @@ class Wt61Driver:
     """Receives the unit's stream; a silent unit is woken up once.
 
     Args:
-        config: averaging and checks.
-        port: port of the unit.
+        config: averaging and check settings.
+        port: the unit's port.
         clock: time.
         out: measurements, in the unit's own axes.
         events: not used.
-        name: name of the service, and of the frame.
+        name: name of the service and of the frame.
     """
 
     def __init__(
@@ -98,10 +98,10 @@ class Wt61Driver:
         """Serve one session.
 
         Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: silence.
-            ProtocolError: bytes without a measurement, or a repeated measurement.
-            WrongDeviceError: the bytes at the start contain no packet of a WT61.
+            DeviceLostError: the unit was unplugged.
+            DeviceTimeoutError: the unit is silent.
+            ProtocolError: bytes arrive without a measurement, or a measurement repeats.
+            WrongDeviceError: the first bytes contain no WT61 packet.
             PortBusyError: another process holds the port.
         """
         async with await self._port.open() as link:
@@ -143,10 +143,10 @@ async def identify(link: Link, clock: Clock, settings: Wt61Config) -> dict[str, 
     """Wait for one measurement.
 
     Returns:
-        JSON-able: ``angular_velocity`` (rad/s), ``acceleration`` (m/s^2), ``temperature_c``.
+        JSON-compatible dict: ``angular_velocity`` (rad/s), ``acceleration`` (m/s^2), ``temperature_c``.
 
     Raises:
-        DeviceError: see the driver's ``run``.
+        DeviceError: the same errors as from the driver's ``run``.
     """
     force, rate = (await Wt61Session(link, clock).start())[-1]
     return {

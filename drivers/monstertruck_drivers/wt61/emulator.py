@@ -1,4 +1,4 @@
-"""Device side of a WT61, byte for byte."""
+"""Emulated WT61, byte for byte."""
 
 import asyncio
 from typing import Final
@@ -23,14 +23,14 @@ SLEEP: Final = "toggle_sleep"
 class Wt61Emulator(FaultyDevice):
     """WT61 that streams from power-up.
 
-    Faults (`inject`): ``frozen on|off`` (repeats the same packets), ``silent on|off``, ``asleep on|off``
-    (standby, until the standby command), ``bad_checksum N`` (the next N packets), ``inverted on|off``
-    (mounted upside down: yaw rate with the wrong sign), ``half_packet``.
+    Faults (`inject`): ``frozen on|off`` (repeats the same packets), ``silent on|off``, ``asleep on|off`` (in standby
+    until it receives the standby command), ``bad_checksum N`` (the next N packets), ``inverted on|off`` (mounted upside
+    down: yaw rate with the wrong sign), ``half_packet``.
 
     Args:
         clock: time.
-        source: physics.
-        seed: seed of the converters' noise.
+        source: physics to measure.
+        seed: seed for the converter noise.
     """
 
     def __init__(self, clock: Clock, source: ImuSource, *, seed: int = 0) -> None:
@@ -116,5 +116,5 @@ def _count(value: int) -> int:
 
 
 def emulated(setup: EmulatorSetup) -> Wt61Emulator:
-    """Create the IMU of a simulated robot."""
+    """Create a simulated robot's IMU."""
     return Wt61Emulator(setup.clock, setup.physics.imu, seed=setup.seed)

@@ -1,8 +1,8 @@
-"""Packets of the WT61 (WitMotion, "WT61 communication protocol").
+"""WT61 packets (WitMotion, "WT61 communication protocol").
 
-A packet has eleven bytes: 0x55, kind, four signed 16-bit numbers with the low byte first, and the sum of the ten bytes
-before it. The unit streams acceleration, angular velocity and angle in turn, without a request. Commands are FF AA
-and one byte.
+A packet has eleven bytes: 0x55, kind, four signed 16-bit numbers with the low byte first, and the sum of the ten
+preceding bytes. The unit streams acceleration, angular velocity and angle in turn, without a request. A command
+consists of FF AA and one byte.
 """
 
 import struct
@@ -37,7 +37,7 @@ Xyz = tuple[float, float, float]
 
 
 class Wt61Packet(NamedTuple):
-    """Raw numbers of one packet."""
+    """Raw values of one packet."""
 
     kind: Wt61Kind
     x: int
@@ -65,21 +65,21 @@ def build(packet: Wt61Packet) -> bytes:
     """Encode a packet.
 
     Raises:
-        struct.error: a number beyond 16 bits.
+        struct.error: a number exceeds 16 bits.
     """
     body = _BODY.pack(HEADER, *packet)
     return body + bytes((sum(body) & 0xFF,))
 
 
 def measured(kind: Wt61Kind, vector: Xyz, celsius: float) -> Wt61Packet:
-    """Return the packet of a measurement in SI units, clipped to the unit's range."""
+    """Return the packet for a measurement in SI units, clipped to the unit's range."""
     unit = _ACCELERATION if kind is Wt61Kind.ACCELERATION else _RATE
     x, y, z = (max(-_MOST, min(_MOST, round(value / unit))) for value in vector)
     return Wt61Packet(kind, x, y, z, round((celsius - 36.53) * 340))
 
 
 class Wt61Parser:
-    """Extracts packets from bytes; counts the bytes outside of packets."""
+    """Extracts packets from a byte stream; counts the bytes outside packets."""
 
     def __init__(self) -> None:
         self.refused = 0

@@ -1,4 +1,4 @@
-"""Loads of the controllers: the motor's shaft and the steering servos' arms."""
+"""Controller loads: the motor shaft and the steering servo arms."""
 
 from collections import deque
 from math import copysign, exp, floor, pi, radians
@@ -58,7 +58,7 @@ class Shaft:
 class Servo:
     """Hobby servo: quantises its pulse, ignores small changes, and turns with a delay and at a limited rate.
 
-    It is limp without pulses.
+    Without pulses, the servo is limp.
 
     Args:
         config: true pulse map and limits.
@@ -79,7 +79,7 @@ class Servo:
         """Angle of the arm (rad)."""
 
     def latch(self, pulse_us: float | None) -> None:
-        """Process one pulse; without pulses (None) the arm stays in place."""
+        """Process one pulse; without pulses (None), the arm remains in place."""
         if pulse_us is None:
             self._held_us = None
             return

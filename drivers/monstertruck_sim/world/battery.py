@@ -18,7 +18,7 @@ def rest_voltage(charge: float, cells: int) -> float:
 
 
 class BatteryModel:
-    """State of the pack; ``step`` advances it.
+    """State of the pack, advanced by ``step``.
 
     Args:
         config: parameters and initial charge.
@@ -35,18 +35,18 @@ class BatteryModel:
         self._filtered = self.volts
 
     def set_charge(self, charge: float) -> None:
-        """Replace the pack by a pack with another charge (0..1)."""
+        """Replace the pack with one at another charge (0..1)."""
         self.charge = charge
         self._rest = rest_voltage(charge, self._config.cells)
         self.volts = self._loaded(self._config.electronics_w / self._rest)
 
     @property
     def analog_volts(self) -> float:
-        """Voltage after divider and filter."""
+        """Voltage after the divider and filter."""
         return self._filtered / self._config.divider + self._config.analog_offset
 
     def step(self, dt: float, motor_w: float, charger_a: float = 0.0) -> None:
-        """Draw the electronics' and the motor's power for dt seconds, less the current of a charger."""
+        """Draw the power of the electronics and the motor for ``dt`` seconds, less a charger's current."""
         config = self._config
         current = (config.electronics_w + motor_w) / max(self.volts, 1.0) - charger_a
         self.current = -current

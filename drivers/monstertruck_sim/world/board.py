@@ -17,9 +17,9 @@ class BoardHolder:
     """A person who holds a board in front of a camera and changes its pose at intervals.
 
     Args:
-        board: the board, and the duration of each pose.
-        field_of_view: field of view of the camera (rad).
-        seed: seed of the board poses.
+        board: the board and the duration of each pose.
+        field_of_view: the camera's field of view (rad).
+        seed: seed for the board poses.
 
     Raises:
         NotInstalledError: the extra ``vision`` is not installed.
@@ -30,7 +30,7 @@ class BoardHolder:
         self._board, self._field_of_view, self._seed = board, field_of_view, seed
 
     def panel_at(self, time_ns: int, place: CameraPlace) -> FlatPanel:
-        """Return the board at a time, in front of a camera that is then at ``place``."""
+        """Return the board at a time at which the camera is at ``place``."""
         slot = time_ns // round(self._board.hold * SECOND)
         return held(self._board, place, generator(self._seed, BOARD, slot), self._field_of_view)
 
@@ -64,7 +64,7 @@ def held(board: HeldBoard, place: CameraPlace, rng: np.random.Generator, field_o
 
 
 def panel_ranges(panel: FlatPanel, origin: Array, directions: Array) -> Array:
-    """Return the range of each beam to a panel, (n,) (m); inf for a miss.
+    """Return each beam's range to a panel (m), shape (n,); inf if the beam misses it.
 
     Args:
         panel: panel in the map frame.

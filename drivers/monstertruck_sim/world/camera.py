@@ -1,6 +1,6 @@
-"""View of the truck's camera for the plane engine: walls as columns, tags and people as flat panels, through a lens.
+"""Camera view for the plane engine: walls as columns, tags and people as flat panels, seen through a lens.
 
-A pixel's ray follows the camera's true lens (Brown's radial distortion) and mount; the ground is level. A panel is
+Each pixel's ray follows the camera's true lens (Brown's radial distortion) and mount; the ground is level. A panel is
 sampled by several rays per pixel, so that a distant tag blurs as on a real sensor.
 """
 
@@ -38,7 +38,7 @@ _GRAIN: Final = 64
 
 
 class CameraPlace(NamedTuple):
-    """Pose of the camera at a time."""
+    """Camera pose at one time."""
 
     centre: Array
     """Position of the lens in the map, (3,) (m)."""
@@ -64,7 +64,7 @@ class FlatPanel(NamedTuple):
 
 
 class Holder(Protocol):
-    """Person who holds a board in front of a camera."""
+    """A person who holds a board in front of a camera."""
 
     def panel_at(self, time_ns: int, place: CameraPlace, /) -> FlatPanel:
         """Return the board at a time, in front of a camera at ``place``."""
@@ -75,8 +75,8 @@ def mounted(pose: Pose2, config: CameraConfig, attitude: tuple[float, float, flo
 
     Args:
         pose: pose of the robot's geometric centre.
-        config: mount of the camera.
-        attitude: pitch, roll (rad) and height (m) of the body.
+        config: camera mount.
+        attitude: pitch (rad), roll (rad) and height (m) of the body.
     """
     body = rotation(pose[2], *attitude[:2])
     centre = np.array((pose[0], pose[1], attitude[2])) + body @ np.array((config.x, config.y, config.height))
@@ -85,7 +85,7 @@ def mounted(pose: Pose2, config: CameraConfig, attitude: tuple[float, float, flo
 
 
 class SimulatedView:
-    """``ViewSource`` of a camera that is fixed to the robot.
+    """``ViewSource`` for a camera that is fixed to the robot.
 
     Args:
         plant: carrier of the camera.
@@ -95,7 +95,7 @@ class SimulatedView:
         crowd: people in the world.
         holder: person who holds a board in front of the camera.
         wall_height: height of the walls (m).
-        seed: seed of the noise; None: no noise.
+        seed: noise seed; None for no noise.
 
     Raises:
         NotInstalledError: tags need the extra ``vision``.
@@ -120,7 +120,7 @@ class SimulatedView:
         self._panels = [tag_panel(tag) for tag in tags]
 
     def ranges(self, time_ns: int, angles: Array) -> Array:
-        """Return the distances at ``time_ns`` along ``angles`` from the truck's axis, (n,) (m); inf without a hit."""
+        """Return the distances (m) at ``time_ns`` along ``angles`` from the truck's axis, (n,); inf without a hit."""
         self.plant.advance(time_ns)
         x, y, yaw = self.plant.poses(np.array([time_ns]))[:3, 0]
         c, s = cos(yaw), sin(yaw)
@@ -130,7 +130,7 @@ class SimulatedView:
         return self._cast(xs, ys, yaw + angles, self.config.reach)
 
     def exposure(self, time_ns: int, size: tuple[int, int]) -> Drawing:
-        """``ViewSource`` that reads the world at once and draws when called."""
+        """Read the world's state now, and draw the image when the result is called."""
         painter = self._painter(size)
         ranges = self.ranges(time_ns, painter.azimuths)
         place = self._place(time_ns)
@@ -156,7 +156,7 @@ class SimulatedView:
         return self._painters[size]
 
     def sensor(self, time_ns: int) -> Callable[[Picture], Picture]:
-        """Apply the effects of light, lens and sensor at an instant to a drawn image."""
+        """Return a function that applies the effects of light, lens and sensor at one time to a drawn image."""
         config, seed = self.config, self._seed
         if seed is None or not config.noise:
             return lambda picture: lit(picture, config)
@@ -164,7 +164,7 @@ class SimulatedView:
         return lambda picture: _grainy(lit(picture, config), seed, config.noise, row, column)
 
     def _in_view(self, place: CameraPlace) -> list[FlatPanel]:
-        """Return the panels that face the camera in its view, the farthest one first."""
+        """Return the panels in view that face the camera, farthest first."""
         found = []
         for panel in self._panels:
             away = panel.corner + (panel.right + panel.down) / 2 - place.centre
@@ -224,8 +224,8 @@ class Painter:
 
         Args:
             ranges: horizontal distance along each of ``azimuths``, (n,) (m); inf without a hit.
-            panels: panels, the last one on top.
-            place: place of the camera.
+            panels: panels in drawing order, the last one on top.
+            place: camera place.
         """
         depth = np.maximum(ranges * self._along, 0.05).astype(np.float32)
         shade = (WALLS + 127 / (1 + depth / 4.0)).astype(np.uint8)  # distance of half brightness, m
@@ -277,7 +277,7 @@ class Painter:
         window[:] = np.rint(colours + (1 - share) * window).astype(np.uint8)
 
     def _unhidden(self, points: Array, place: CameraPlace, ranges: Array) -> NDArray[np.bool_]:
-        """Return which points, relative to the camera in the map's axes, no wall hides."""
+        """Return which points (relative to the camera, in map axes) are not hidden by a wall."""
         axis = place.axes[2]
         ahead = np.arctan2(axis[1], axis[0])
         azimuths = np.angle(np.exp(1j * (np.arctan2(points[..., 1], points[..., 0]) - ahead)))
@@ -300,13 +300,13 @@ class Painter:
         return wider, np.stack((right / wider + (width - 1) / 2, down / wider + (height - 1) / 2), axis=-1)
 
     def _bent(self, right: Array, down: Array) -> Array:
-        """Return the image points of directions, in focal lengths, (n, 2)."""
+        """Return the image points for directions, in focal lengths, (n, 2)."""
         square = right**2 + down**2
         factor = 1 + self._config.k1 * square + self._config.k2 * square**2
         return np.stack((right * factor, down * factor), axis=-1)
 
     def _straight(self, right: Array, down: Array) -> tuple[Array, Array]:
-        """Return the directions of image points, in focal lengths: the inverse of ``_bent``."""
+        """Return the directions for image points, in focal lengths: the inverse of ``_bent``."""
         if not (self._config.k1 or self._config.k2):
             return right, down
         x, y = right, down
@@ -318,7 +318,7 @@ class Painter:
 
 
 def compile_kernels() -> None:
-    """Compile the drawing functions unless done before; blocks the process for about a second."""
+    """Compile the drawing functions unless already compiled; blocks the process for about a second."""
     config = CameraConfig()
     picture = Painter(config, (2, 2), 0.6).picture(np.ones(2), (), mounted((0.0, 0.0, 0.0), config))
     _grainy(picture, 0, 1.0, 0, 0)
@@ -328,7 +328,7 @@ def compile_kernels() -> None:
 
 
 def _between(texture: NDArray[np.uint8], across: Array, along: Array) -> NDArray[np.uint8]:
-    """Sample a texture at positions in pixels, whose corners are integers, by bilinear interpolation."""
+    """Sample a texture by bilinear interpolation at pixel positions, where integers are pixel corners."""
     cv2 = opencv("sim.world.board")
     at = (np.nan_to_num(places - 0.5, posinf=-1.0, neginf=-1.0).astype(np.float32) for places in (across, along))
     return np.asarray(cv2.remap(texture, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), dtype=np.uint8)
@@ -349,7 +349,7 @@ def opencv(key: str) -> Any:
 
 @cache
 def tag_pattern(tag: int) -> NDArray[np.uint8]:
-    """Return a tag of family 36h11 with its white border, one pixel per cell, (10, 10).
+    """Return a 36h11 tag with its white border, one pixel per cell, (10, 10).
 
     Raises:
         NotInstalledError: the extra ``vision`` is not installed.
@@ -361,7 +361,7 @@ def tag_pattern(tag: int) -> NDArray[np.uint8]:
 
 
 def tag_panel(tag: TagConfig) -> FlatPanel:
-    """Return the panel of a tag: upright and facing ``yaw``, or lying with its upper edge towards ``yaw``."""
+    """Return the panel of a tag: upright and facing ``yaw``, or lying flat with its upper edge towards ``yaw``."""
     pattern = tag_pattern(tag.tag)
     side = tag.size * len(pattern) / CELLS
     right, up = tag_axes(tag.yaw, lies=tag.lies)
@@ -391,7 +391,7 @@ def person_panel(x: float, y: float, radius: float, place: CameraPlace) -> FlatP
 
 @cache
 def _person() -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Return texture and outline of a person: 2 cm per pixel at a radius of 0.2 m."""
+    """Return a person's texture and outline, at 2 cm per pixel for a radius of 0.2 m."""
     rows, columns = np.mgrid[0:85, 0:20]
     head = ((rows - 7) / 7.5) ** 2 + ((columns - 9.5) / 5.5) ** 2 < 1
     trunk = (rows >= 15) & (rows < 46) & (np.abs(columns - 9.5) < 9.6 - np.maximum(0, 18 - rows))
@@ -434,7 +434,7 @@ def _grainy(picture: Picture, seed: int, noise: float, row: int, column: int) ->
 
 @njit(cache=True)
 def _added(picture: Picture, grain: NDArray[np.int16], row: int, column: int) -> Picture:
-    """Add the grain tile that begins at (row, column), equal in all colours."""
+    """Add the grain tile that begins at (row, column), identical in all colours."""
     height, width, colours = picture.shape
     noisy = np.empty_like(picture)
     for i in range(height):
@@ -455,7 +455,7 @@ def _painted(
     ground: NDArray[np.uint8],
     palette: NDArray[np.uint8],
 ) -> Picture:
-    """Return the colours of pixels (height, width): wall between the slopes of their fan column, otherwise ground."""
+    """Return the colours of pixels (height, width): wall between the fan column's slopes, otherwise ground."""
     height, width = slope.shape
     picture = np.empty((height, width, 3), np.uint8)
     for i in range(height):

@@ -1,4 +1,4 @@
-"""Settings of the simulated world; the defaults describe the truck.
+"""Simulated world settings; the defaults describe the truck.
 
 These are the *true* values of the plant. The daemon has its own calibration: to create a hidden error, change a value
 here only. ``noise: false`` keeps the physics and disables every random part.
@@ -61,7 +61,7 @@ class MotorConfig(Schema):
     clutch_force: Positive = 25.0
     """Pull at the ground that makes the slipper clutch slip, N (less than the grip of 35 N: wheels never spin)."""
     coast_rpm_s: Positive = 30_000.0
-    """Deceleration of the unpowered motor by friction, rpm/s."""
+    """Deceleration of the unpowered motor due to friction (rpm/s)."""
     torque_constant: Positive = 0.0127
     """Torque constant, Nm/A (24 V at 18000 rpm)."""
     efficiency: Annotated[float, Field(gt=0, le=1)] = 0.5
@@ -73,13 +73,13 @@ class MotorConfig(Schema):
     rotor_inertia: NotNegative = 1e-6
     """Moment of inertia of the rotor, kg m^2."""
     winding_resistance: NotNegative = 2.0
-    """Resistance of the winding (ohm)."""
+    """Winding resistance (ohm)."""
     current_noise: NotNegative = 0.01
     """Standard deviation of the measured current (A)."""
 
 
 class AxleConfig(Schema):
-    """Linkage polynomials of one axle, rad, highest power first."""
+    """Linkage polynomials of one axle (rad), highest power first."""
 
     left_from_servo: Annotated[tuple[float, ...], Field(strict=False, min_length=2)]
     right_from_left: Annotated[tuple[float, ...], Field(strict=False, min_length=2)]
@@ -93,7 +93,7 @@ class LinkageConfig(Schema):
 
     @property
     def polynomials(self) -> SteeringPolynomials:
-        """Steering polynomials for the kinematics.
+        """Return the steering polynomials for the kinematics.
 
         Raises:
             KinematicsError: the wheels do not follow their servo.
@@ -106,7 +106,7 @@ class SkidModelConfig(Schema):
     """Effects of a skid-steer robot that its body parameters do not cover."""
 
     wheel_gains: Annotated[tuple[Positive, ...], Field(strict=False)] = ()
-    """Ratio of effective to nominal wheel radius per shaft, as motors and wheels are not identical; empty: all 1"""
+    """Ratio of effective to nominal wheel radius for each shaft, as motors and wheels differ; empty: all 1"""
     reversal_turn: float = 0.0
     """Mean turn at each reversal of the direction of travel, left positive (rad)"""
     reversal_spread: NotNegative = 0.0
@@ -120,9 +120,9 @@ class SkidModelConfig(Schema):
 class SimTruckConfig(Schema):
     """Body, wheels and tyres.
 
-    Tyre slip: an axle travels at its wheels' angle less ``slip_angle`` times its lateral acceleration (gravity on a
-    side slope included). The body travels less than the wheels roll, by ``slip_per_newton`` times the pull.
-    Both have a slow random part. An unsteered wheel rolls along its own axis.
+    Tyre slip: an axle travels at its wheels' angle less ``slip_angle`` times its lateral acceleration (including
+    gravity on a side slope). The body travels less far than the wheels roll, by a fraction ``slip_per_newton`` times
+    the pull. Both slips have a slow random part. An unsteered wheel rolls along its own axis.
     """
 
     body: AnyBody = TruckBody()
@@ -233,7 +233,7 @@ class MechanicsConfig(Schema):
     axle_roll_deg: Annotated[float, Field(gt=0, le=45)] = 10.0
     """Maximum roll of an axle relative to the chassis (degrees)."""
     friction: Positive = 0.5
-    """Coefficient of friction between tyres and ground."""
+    """Friction coefficient between tyres and ground."""
     tyre_stiffness: NotNegative = 60.0
     """Force of one rolling tyre per slip angle, N/rad (half the axle stiffness of the single-track model), and per
     slip ratio, N, for small slip; 0: rigid wheels"""
@@ -253,7 +253,7 @@ class BatteryModelConfig(Schema):
     resistance: NotNegative = 0.08
     """Instantaneous resistance of cells and wiring (ohm)."""
     recovery_resistance: NotNegative = 0.04
-    """Resistance of the additional sag that builds up and recovers with ``recovery_time`` (ohm)."""
+    """Resistance behind the additional sag, which builds up and recovers with ``recovery_time`` (ohm)."""
     recovery_time: Positive = 20.0
     """Time constant of the additional sag (s)."""
     electronics_w: NotNegative = 25.0
@@ -300,11 +300,11 @@ class LidarConfig(Schema):
     max_range: Positive | None = None
     """Maximum range (m); null: from the device's data sheet."""
     accuracy_sigmas: Positive = SIGMAS
-    """Error bound of the data sheet in standard deviations."""
+    """The data sheet's error bound in standard deviations."""
     dropout: Fraction = 0.002
     """Probability that a single beam fails."""
     wall_height: Positive = 0.6
-    """Height of everything in the map (m); beams tilted upwards may pass over it."""
+    """Height of all walls in the map (m); beams tilted upwards may pass over them."""
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
@@ -351,7 +351,7 @@ class CameraConfig(Schema):
 
 
 class TagConfig(Schema):
-    """An AprilTag of family 36h11 in the world: upright, as on a wall, or lying."""
+    """A 36h11 AprilTag in the world: upright, as on a wall, or lying flat."""
 
     tag: Annotated[int, Field(ge=0, le=586)]
     """Tag number."""
@@ -362,7 +362,7 @@ class TagConfig(Schema):
     z: float = 0.25
     """Height above the ground (m)."""
     yaw: float = 0.0
-    """Direction the tag faces (rad); for a lying tag, the direction of its upper edge."""
+    """Direction that the tag faces (rad); for a tag lying flat, the direction of its upper edge."""
     size: Annotated[float, Field(gt=0.01, le=1)] = 0.1
     """Side of the black square (m)."""
     lies: bool = False
@@ -370,7 +370,7 @@ class TagConfig(Schema):
 
 
 class ChargerConfig(Schema):
-    """Charging contacts on the ground, too low for lidar and camera, with the robot's pose for charging."""
+    """Charging contacts on the ground, too low for lidar and camera to see, with the robot's charging pose."""
 
     x: float
     """x of the robot's geometric centre on the contacts (m)."""
@@ -379,9 +379,9 @@ class ChargerConfig(Schema):
     yaw: float = 0.0
     """Heading of the robot (rad)."""
     tolerance: Positive = 0.015
-    """Maximum distance from that pose for closed contacts (m)."""
+    """Maximum distance from the charging pose at which the contacts close (m)."""
     turn_tolerance: Positive = 0.035
-    """Maximum heading error for closed contacts (rad)."""
+    """Maximum heading error at which the contacts close (rad)."""
     current: NotNegative = 3.0
     """Charging current (A); 0: the charger is off."""
 
@@ -396,7 +396,7 @@ class HeldBoard(BoardConfig):
 
 
 class RoofTag(Schema):
-    """An AprilTag lying on the robot, upper edge towards the front; visible in three dimensions only."""
+    """An AprilTag lying on the robot, with its upper edge towards the front; visible only in three dimensions."""
 
     tag: Annotated[int, Field(ge=0, le=586)]
     """Number of the tag in its family."""
@@ -411,7 +411,7 @@ class RoofTag(Schema):
 
 
 class Iron(Schema):
-    """Magnetic error due to the truck's metal: measured = soft * true + hard, per device axis x, y, z."""
+    """Magnetic error due to the truck's metal: measured = soft * true + hard for each device axis x, y, z."""
 
     hard_x: float = 0.0
     """Hard-iron offset in x, mG."""
@@ -439,23 +439,23 @@ class CompassModelConfig(Schema):
     vertical_field: float = -390.0
     """Vertical field, upwards positive, mG (northern hemisphere: downwards)."""
     deviation_deg: NotNegative = 0.4
-    """Maximum error of the deviation curve, which is fixed and smooth over the heading (degrees)."""
+    """Maximum of the deviation curve, which is fixed and varies smoothly with heading (degrees)."""
     noise_deg: NotNegative = 0.1
     """Standard deviation of heading, pitch and roll (degrees)."""
     tilt_bias_deg: NotNegative = 0.2
     """Maximum fixed error of pitch and of roll (degrees)."""
     motor_field: float = 5.0
-    """Field along the device's y per ampere of motor current, mG/A (1.1 degrees at 1 A)."""
+    """Field along the device's y axis per ampere of motor current (mG/A); 1.1 degrees at 1 A."""
     temperature_c: float = 25.0
     """Temperature that the device reports, degrees Celsius."""
     iron: Iron = Iron()
 
 
 class HornConfig(Schema):
-    """Assembly of a servo of the lidar mount."""
+    """Assembly of a lidar mount servo."""
 
     zero: float | None = None
-    """Position of a lidar parallel to the body, steps; None: from the driver settings."""
+    """Position (steps) at which the lidar is parallel to the body; None: from the driver settings."""
     direction: Literal[-1, 1] | None = None
     """+1 if a rising position turns the joint positively (REP 103); None: from the driver settings."""
 
@@ -468,7 +468,7 @@ class MountConfig(Schema):
 
 
 class SonarPlace(Schema):
-    """Sonar mount: position relative to the geometric centre, m, and direction of the axis, left positive (rad)."""
+    """Sonar mount: position relative to the geometric centre (m) and direction of the axis (rad, left positive)."""
 
     x: float
     y: float
@@ -490,8 +490,8 @@ class SonarModelConfig(Schema):
     """Ultrasonic range finders.
 
     ``beam``: range along the axis to walls that reflect in all directions. ``cone``: nearest echo from anywhere in the
-    cone. Walls are mirrors for sound that meets them at more than ``critical_angle`` from the normal; edges and corners
-    reflect in all directions. A sonar mistakes the sound of another sonar for its own.
+    cone. Walls act as mirrors for sound that hits them at more than ``critical_angle`` from the normal; edges and
+    corners reflect in all directions. A sonar mistakes the sound of another sonar for its own.
     """
 
     model: Literal["beam", "cone"] = "cone"
@@ -499,7 +499,7 @@ class SonarModelConfig(Schema):
     field_of_view: Annotated[float, Field(gt=0, lt=3)] = 0.87
     """Full opening angle of the cone (rad)."""
     range_min: NotNegative = 0.15
-    """Minimum range (m); nearer objects are reported at this range."""
+    """Minimum range (m); closer objects are reported at this range."""
     range_max: Positive = 3.0
     """Maximum range (m)."""
     noise: NotNegative = 0.005
@@ -513,11 +513,11 @@ class SonarModelConfig(Schema):
     cross_talk: bool = True
     """Whether a sonar hears the pings of others; ``cone`` only."""
     audible: Positive = 6.0
-    """Maximum distance of a wall with an audible echo, m; an echo from beyond ``range_max`` may meet the next ping."""
+    """Maximum distance (m) of a wall with an audible echo; echoes from beyond ``range_max`` may meet the next ping."""
     sonars: dict[FrameId, SonarPlace] = FIVE_SONARS
     """Sonar mounts by name."""
     height: NotNegative = 0.12
-    """Height of all sonars above the ground (m); on a leaning body some sonars look over the walls."""
+    """Height of all sonars above the ground (m); on a tilted body, some sonars look over the walls."""
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
@@ -553,7 +553,7 @@ class GroundTilt(Schema):
 
 
 class RoughPatch(Schema):
-    """A rectangle of rough ground: waves along x and along y, added to the height of the ground."""
+    """A rectangle of rough ground: waves along x and y, added to the ground height."""
 
     x: float
     """x of the centre (m)."""
@@ -615,7 +615,7 @@ class PersonConfig(Schema):
     distance: NotNegative = 0.8
     """Distance kept from robots and other people ahead (m)"""
     before: Literal["stop", "turn", "walk_on"] = "stop"
-    """Reaction to a robot or person ahead: stop and turn back after 3 s; turn aside; or keep walking until contact"""
+    """Reaction to a robot or person ahead: stop, then turn back after 3 s; turn aside; or keep walking until contact"""
 
     @model_validator(mode="after")
     def _somewhere(self) -> Self:
@@ -625,7 +625,7 @@ class PersonConfig(Schema):
 
 
 class Hills(Schema):
-    """Random smooth ground with a separate seed: hills, or the roughness of a meadow with a short wavelength."""
+    """Smooth random ground with its own seed: hills, or the roughness of a meadow with a short wavelength."""
 
     kind: Literal["hills"]
     height: NotNegative = 0.05
@@ -691,7 +691,7 @@ class Ditch(Schema):
 
 
 class Rubble(Schema):
-    """Flat stones scattered at random over a rectangle, with a separate seed."""
+    """Flat stones scattered at random over a rectangle, with their own seed."""
 
     kind: Literal["rubble"]
     x: float = 0.0
@@ -735,7 +735,7 @@ SOLID_BODIES: Final = ("truck", "ackermann", "skid_steer", "differential", "omni
 
 
 class WorldConfig(Schema):
-    """One simulated world, and one robot in it."""
+    """One simulated world and one robot in it."""
 
     map: str = "loop"
     """Name of a built-in world, or path of a map_server YAML file (ground: ``NAME.profile.yaml`` next to it)."""

@@ -1,4 +1,4 @@
-"""Conversion of the configured body, masses and springs to the description of the robot."""
+"""Convert the configured body, masses and springs to the robot description."""
 
 from math import radians
 
@@ -20,10 +20,10 @@ from monstertruck_sim.world.config import MechanicsConfig, SimTruckConfig
 
 
 def mechanics(truck: SimTruckConfig, config: MechanicsConfig) -> Mechanics:
-    """Return the inputs of the description.
+    """Return the inputs for the description.
 
     Raises:
-        InputError: impossible masses.
+        InputError: the masses are impossible.
     """
     try:
         return Mechanics(
@@ -64,7 +64,7 @@ def description(
     sensors: tuple[SensorFrame, ...] = (),
     head: LidarHead | None = None,
 ) -> Description:
-    """Return the mechanics of a robot with a body of ``SOLID_BODIES``.
+    """Return the mechanics of a robot whose body is one of ``SOLID_BODIES``.
 
     Args:
         truck: body and dimensions.
@@ -73,7 +73,7 @@ def description(
         head: the lidar on its joints; None for a fixed lidar.
 
     Raises:
-        InputError: impossible masses or springs.
+        InputError: the masses or springs are impossible.
     """
     try:
         return _description(truck, parts, sensors, head)

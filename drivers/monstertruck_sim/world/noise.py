@@ -14,15 +14,15 @@ _BLOCK = 512
 
 
 def generator(seed: int, stream: int, index: int = 0) -> np.random.Generator:
-    """Return the generator of one block of draws, by a counter-based algorithm."""
+    """Return the generator for one block of draws, using a counter-based algorithm."""
     return np.random.Generator(np.random.Philox(key=[seed, stream], counter=[0, index, 0, 0]))
 
 
 class WhiteNoise:
-    """Standard normal noise of ``size`` channels, drawn in blocks of neighbouring indices.
+    """Standard normal noise in ``size`` channels, drawn in blocks of neighbouring indices.
 
     Args:
-        seed: seed of the world.
+        seed: the world's seed.
         stream: one of the streams above.
         size: number of channels.
     """
@@ -33,7 +33,7 @@ class WhiteNoise:
         self._values: list[float] = []
 
     def at(self, index: int) -> list[float]:
-        """Return the values of an index (0 or more), one per channel."""
+        """Return the values at an index (0 or more), one per channel."""
         block, row = divmod(index, _BLOCK)
         if block != self._block:
             drawn = generator(self._seed, self._stream, block).standard_normal(_BLOCK * self._size)
@@ -45,7 +45,7 @@ class SlowNoise:
     """White noise drawn every ``period_ns``, with linear interpolation.
 
     Args:
-        seed: seed of the world.
+        seed: the world's seed.
         stream: one of the streams above.
         size: number of channels.
         period_ns: interval between draws (ns).
@@ -59,7 +59,7 @@ class SlowNoise:
         """Value at the start of the slot and change over it, per channel."""
 
     def at(self, elapsed_ns: int) -> list[float]:
-        """Return the values at a time since the world's start, one per channel."""
+        """Return the values at a time since the start of the world, one per channel."""
         slot, rest = divmod(elapsed_ns, self._period)
         if slot != self._slot:
             ends = self._white.at(slot), self._white.at(slot + 1)

@@ -29,7 +29,7 @@ class Box:
     yaw: float = 0.0
 
     def corners(self) -> Array:
-        """Corners in the map frame, (4, 2), counter-clockwise (m)."""
+        """Corners in the map frame (m), counter-clockwise, shape (4, 2)."""
         c, s = cos(self.yaw), sin(self.yaw)
         local = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * (self.length / 2, self.width / 2)
         corners: Array = local @ np.array([(c, s), (-s, c)]) + (self.x, self.y)
@@ -40,7 +40,7 @@ Obstacle = Disc | Box
 
 
 def discs_and_segments(obstacles: Iterable[Obstacle]) -> tuple[Array, Array]:
-    """Input of the ray caster: discs (n, 3) of x, y, radius and segments (m, 4) of x0, y0, x1, y1."""
+    """Return the ray caster's input: discs (n, 3) of x, y, radius and segments (m, 4) of x0, y0, x1, y1."""
     discs: list[tuple[float, float, float]] = []
     segments: list[Array] = []
     for obstacle in obstacles:

@@ -29,13 +29,13 @@ class Person:
     Args:
         name: name in contact reports.
         config: way-points and behaviour.
-        seed: seed of the world.
-        index: index among the people.
+        seed: the world's seed.
+        index: the person's index.
         free: free-space test of the map.
         bounds: area for random way-points: minimum and maximum x, then y (m).
 
     Raises:
-        ValueError: a way-point or the leg between two is not free, or no free place can be drawn.
+        ValueError: a way-point or the leg between two way-points is not free, or no free place can be drawn.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class Person:
 
     @property
     def disc(self) -> Disc:
-        """Footprint of the person."""
+        """The person's footprint."""
         return Disc(self.x, self.y, self.radius)
 
     def step(self, now_ns: int, others: Sequence[Round], touched: Callable[[Disc], bool]) -> None:
@@ -95,7 +95,7 @@ class Person:
         self._trail.append((now_ns, self.x, self.y))
 
     def places(self, times_ns: Array) -> Array:
-        """Return the centres at elapsed times within the last 0.8 s: (2, n) (m)."""
+        """Return the centres (m) at elapsed times within the last 0.8 s, shape (2, n)."""
         if not self._trail:
             return np.repeat([[self.x], [self.y]], len(times_ns), axis=1)
         at, xs, ys = np.array(self._trail, dtype=float).T
@@ -144,7 +144,7 @@ class Person:
         return False
 
     def _choose(self) -> None:
-        """Choose the next way-point and the pace of the leg."""
+        """Choose the next way-point and the pace for the leg."""
         self._before = (self.x, self.y)
         self._pace = self._config.speed * float(self._rng.uniform(0.8, 1.2))
         if self._given:

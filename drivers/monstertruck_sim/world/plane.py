@@ -1,4 +1,4 @@
-"""The engine ``plane``: a footprint that moves over a map, with a tilt from the ground profile or as commanded."""
+"""The engine ``plane``: a footprint that moves over a map, tilted by the ground profile or as commanded."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -27,8 +27,8 @@ class PlanOutline:
 
     Args:
         scene: the surroundings.
-        truck: size of the robot.
-        name: name of the robot.
+        truck: robot dimensions.
+        name: robot name.
     """
 
     def __init__(self, scene: Surroundings, truck: SimTruckConfig, name: str) -> None:
@@ -40,17 +40,17 @@ class PlanOutline:
         """Obstacles at the time of ``_free``."""
 
     def box(self, pose: Pose2, room: float = 0.0) -> Box:
-        """Return the footprint at a pose, grown by ``room`` on all sides."""
+        """Return the footprint at a pose, enlarged by ``room`` on all sides."""
         x, y, yaw = pose
         return Box(x, y, self._truck.length + 2 * room, self._truck.width + 2 * room, yaw)
 
     def pace(self, twist: Twist2) -> float:
-        """Return the speed of the fastest point (m/s)."""
+        """Return the speed of the footprint's fastest point (m/s)."""
         vx, vy, wz = twist
         return hypot(vx, vy) + abs(wz) * self._half_diagonal
 
     def blocked(self, pose: Pose2, twist: Twist2) -> None:
-        """Report a contact with the bodies that block the move to a pose."""
+        """Report contacts with the bodies that block the move to a pose."""
         self.scene.report(self.box(pose), self.name, self.pace(twist))
 
     def overlap(self, x: float, y: float, yaw: float) -> float:
@@ -79,15 +79,15 @@ class PlanOutline:
         return hypot(b[0] - a[0], b[1] - a[1]) + abs(b[2] - a[2]) * self._half_diagonal
 
     def _depth(self, pose: Pose2, room: float = 0.0) -> float:
-        """Return the penetration of the footprint, grown by ``room`` on all sides, into fixed objects (m)."""
+        """Return how deep the footprint, enlarged by ``room`` on all sides, penetrates fixed objects (m)."""
         return self.scene.fixed_overlap(self.box(pose, room))
 
 
 class Space(ABC):
-    """Surroundings of one robot.
+    """One robot's surroundings.
 
     Args:
-        footprint: footprint of the robot in its surroundings.
+        footprint: the robot's footprint in its surroundings.
     """
 
     def __init__(self, footprint: PlanOutline) -> None:
@@ -105,7 +105,7 @@ class Space(ABC):
         """Add an obstacle that the lidar sees and that stops robots.
 
         Raises:
-            InputError: there is no room for more.
+            InputError: there is no room for another obstacle.
         """
         self._scene.set_obstacles((*self.obstacles, obstacle))
 
@@ -122,7 +122,7 @@ class Space(ABC):
 
     @abstractmethod
     def set_tilt(self, tilt: TiltConfig) -> None:
-        """Set the tilt of the robot from now on.
+        """Change the robot's tilt.
 
         Raises:
             InputError: the engine computes the tilt itself.
@@ -144,8 +144,8 @@ class PlaneSpace(Space):
     """``Space`` of the plane engine.
 
     Args:
-        footprint: footprint of the robot in its surroundings.
-        config: settings of the world.
+        footprint: the robot's footprint in its surroundings.
+        config: world settings.
     """
 
     def __init__(self, footprint: PlanOutline, config: WorldConfig) -> None:
@@ -158,11 +158,11 @@ class PlaneSpace(Space):
         self._tilt: TiltConfig = config.tilt
 
     def set_tilt(self, tilt: TiltConfig) -> None:
-        """Set the tilt of the robot from now on."""
+        """Change the robot's tilt."""
         self._tilt = tilt
 
     def attitude(self, elapsed_ns: int, x: float, y: float, yaw: float) -> tuple[float, float]:
-        """Return pitch and roll of the robot at a pose (rad)."""
+        """Return the robot's pitch and roll at a pose (rad)."""
         if isinstance(self._tilt, SinusoidTilt):
             return rocking(self._tilt, elapsed_ns)
         if isinstance(self._tilt, SteadyTilt):

@@ -1,4 +1,4 @@
-"""Engine-independent interface between a robot's physics and its sensors and actuators, and code the engines share."""
+"""Engine-independent interface between a robot's physics and its sensors and actuators; code shared by the engines."""
 
 from abc import ABC, abstractmethod
 from collections import deque
@@ -57,7 +57,8 @@ class Caster(Protocol):
     ) -> Array:
         """Return ranges along rays from (xs, ys) at ``angles`` in the map frame, up to ``reach``; inf without a hit.
 
-        Moving objects are hit where they were at ``times_ns``: one rising time per ray, or None for now.
+        Moving objects are hit where they were at ``times_ns``: increasing times, one per ray, or None for the current
+        time.
         """
 
 
@@ -67,8 +68,8 @@ class Plant(ABC):
     Args:
         config: true parameters.
         battery: battery model parameters.
-        start: pose of the geometric centre.
-        attitude: pitch and roll at the start.
+        start: initial pose of the geometric centre.
+        attitude: initial pitch and roll (rad).
     """
 
     STEP_NS: ClassVar[int]
@@ -113,7 +114,7 @@ class Plant(ABC):
 
     @property
     def pose(self) -> Pose2:
-        """Latest pose of the geometric centre in the map frame; the yaw is unwrapped."""
+        """Latest pose of the geometric centre in the map frame, with unwrapped yaw."""
         return self._pose
 
     @property
@@ -129,7 +130,7 @@ class Plant(ABC):
     @property
     @abstractmethod
     def acceleration(self) -> Xyz:
-        """Acceleration of the body without gravity, as sensed on it: forward, left, up in its level frame (m/s^2)."""
+        """Acceleration without gravity, as sensed on the body: forward, left, up in its level frame (m/s^2)."""
 
     @property
     @abstractmethod
@@ -142,7 +143,7 @@ class Plant(ABC):
         return sum(self.currents)
 
     def advance(self, time_ns: int) -> None:
-        """Integrate up to an instant; the first call sets the start, and earlier instants have no effect."""
+        """Integrate up to a time; the first call sets the start, and earlier times have no effect."""
         self.together(time_ns)
         self.integrate(time_ns)
 
@@ -170,7 +171,7 @@ class Plant(ABC):
         """Move the robot to another pose, at rest; sensors see a jump, not a path between the two places."""
 
     def slot(self, time_ns: int, period_ns: int) -> int:
-        """Return the index, counted from the start, of the period that contains an instant; it selects the noise."""
+        """Return the index, counted from the start, of the period that contains a time; the index selects the noise."""
         return max(0, time_ns - (self._start_ns or 0)) // period_ns
 
     def truth(self) -> TruthState:
@@ -197,10 +198,10 @@ class Plant(ABC):
         )
 
     def poses(self, times_ns: NDArray[np.int64]) -> Array:
-        """Return poses at instants within the last half second, (6, n): x, y, yaw, pitch, roll, height of the base.
+        """Return poses at times within the last half second, (6, n): x, y, yaw, pitch, roll, height of the base.
 
-        In the plane the height is 0 on any ground. Poses at instants not yet integrated are extrapolated at the current
-        velocity and do not affect the integration.
+        In the plane the height is 0 on any ground. Poses at times not yet integrated are extrapolated at the current
+        velocity, without affecting the integration.
         """
         assert self._start_ns is not None
         seconds = (times_ns - self._start_ns) * 1e-9
@@ -244,7 +245,7 @@ class Plant(ABC):
         self.battery.step(dt, watts, self._charging())
 
     def _charging(self) -> float:
-        """Return the current of the charger whose contacts the robot stands on (A)."""
+        """Return the current (A) from the charger on whose contacts the robot stands."""
         x, y, yaw = self._pose
         for charger in self.chargers:
             off, turn = hypot(x - charger.x, y - charger.y), remainder(yaw - charger.yaw, 2 * pi)
@@ -260,7 +261,7 @@ class Plant(ABC):
 
 
 def motor_current(config: SimTruckConfig, shaft: Shaft, pull: float) -> float:
-    """Return the current of a motor whose wheels pull with ``pull`` (N at the ground); A, forwards positive."""
+    """Return the current (A, forwards positive) of a motor whose wheels pull with ``pull`` (N at the ground)."""
     motor = config.motor
     if not shaft.powered:
         return 0.0

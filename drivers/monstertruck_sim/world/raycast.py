@@ -1,8 +1,9 @@
-"""Exact ray casting and footprint contact on an occupancy grid, by numba.
+"""Exact ray casting and footprint contact on an occupancy grid, compiled with numba.
 
 A range is the distance to the boundary of the first occupied cell, not a multiple of the cell size. A ray skips the
-empty square around its cell, whose size is the grid's ``clearance``: it visits a subset of the cells of a walk cell by
-cell (Amanatides and Woo, "A Fast Voxel Traversal Algorithm for Ray Tracing", 1987), so the range is the same.
+empty square around its cell, whose size is the grid's ``clearance``: it visits a subset of the cells visited by a
+cell-by-cell walk (Amanatides and Woo, "A Fast Voxel Traversal Algorithm for Ray Tracing", 1987), so the range is the
+same.
 """
 
 from math import cos, floor, inf, sin, sqrt
@@ -20,13 +21,13 @@ Clearance = NDArray[np.uint8]
 def clearance(occupied: NDArray[np.bool_]) -> Clearance:
     """Return each cell's distance to the nearest occupied cell (Chebyshev, in cells), at most 255.
 
-    Two passes, each from one corner over the neighbours already visited.
+    Uses two passes, each from one corner over the neighbours already visited.
 
     Args:
         occupied: (rows, columns).
 
     Returns:
-        (rows, columns) uint8; cells outside the grid are free.
+        (rows, columns), uint8; cells outside the grid count as free.
     """
     rows, columns = occupied.shape
     clear = np.empty((rows, columns), np.uint8)
@@ -53,7 +54,7 @@ def clearance(occupied: NDArray[np.bool_]) -> Clearance:
 
 @njit(cache=True)
 def _entry(x: float, direction: float, cells: int) -> float:
-    """Distance along a ray at which it enters the range 0 to ``cells`` on one axis; inf if never."""
+    """Distance along a ray at which it enters the range 0 to ``cells`` on one axis; inf if it never does."""
     if 0.0 <= x < cells:
         return 0.0
     if direction == 0.0 or (x < 0.0) != (direction > 0.0):
@@ -131,12 +132,12 @@ def cast_rays(
     """Return the distance to the first hit of each ray (m); inf without a hit within ``reach``.
 
     Args:
-        clear: ``clearance`` of the grid, (rows, columns), row 0 lowest y; outside the grid is free.
+        clear: ``clearance`` of the grid, (rows, columns), row 0 at the lowest y; cells outside the grid count as free.
         resolution: cell side (m).
         origin_x: x of the grid's lower left corner in the map frame (m).
         origin_y: y of the grid's lower left corner in the map frame (m).
-        xs: (n,) ray origins in the map frame (m): one per ray, so that a sensor may move during its sweep.
-        ys: (n,) as ``xs``.
+        xs: (n,) x of the ray origins in the map frame (m); one per ray, because a sensor may move during its sweep.
+        ys: (n,) y of the ray origins (m).
         angles: (n,) ray directions in the map frame (rad).
         reach: maximum distance (m).
         discs: (k, 3) of x, y, radius in the map frame (m).
@@ -168,9 +169,9 @@ def grid_penetration(
     Args:
         occupied: (rows, columns), row 0 lowest y.
         resolution: cell side (m).
-        x: centre of the rectangle, m, relative to the grid's lower left corner.
+        x: x of the rectangle's centre relative to the grid's lower left corner (m).
         y: as ``x``.
-        yaw: direction of its length (rad).
+        yaw: direction of the rectangle's length (rad).
         length: length of the rectangle (m).
         width: width of the rectangle (m).
     """

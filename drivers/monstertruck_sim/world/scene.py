@@ -1,7 +1,7 @@
 """Surroundings shared by the robots of one world: map, ground, obstacles, people, the robots' outlines, and time.
 
-All bodies move on one time grid of 5 ms: before a robot is integrated to an instant, everything is advanced to the
-last grid point before it. The poses of the others are therefore at most 5 ms old: 1 mm at 0.2 m/s.
+All bodies move on one time grid of 5 ms: before a robot is integrated to an instant, everything is advanced to the last
+grid point before it. The poses of other bodies are therefore at most 5 ms old: 1 mm at 0.2 m/s.
 """
 
 from collections.abc import Callable, Sequence
@@ -46,13 +46,13 @@ class Contact:
 
 
 class Neighbour(Protocol):
-    """Interface of a robot to the other bodies."""
+    """Interface of a robot to other bodies."""
 
     name: str
 
     @property
     def plant(self) -> Plant:
-        """Physics of the robot."""
+        """The robot's physics."""
 
     @property
     def outline(self) -> Box:
@@ -75,8 +75,8 @@ class Surroundings:
     Args:
         place: map and ground.
         people: people who walk through the world.
-        seed: seed of the people.
-        starts: start poses of all robots; hills are level there.
+        seed: seed for the people.
+        starts: start poses of all robots, around which hills are level.
 
     Raises:
         InputError: a person's path is not free.
@@ -121,7 +121,7 @@ class Surroundings:
         """Add a robot.
 
         Raises:
-            InputError: its name is taken, or it overlaps a robot or a person.
+            InputError: the robot's name is taken, or it overlaps another robot or a person.
         """
         outline = body.outline
         for other in self.bodies:
@@ -159,7 +159,7 @@ class Surroundings:
     # Contact
 
     def fixed_overlap(self, box: Box) -> float:
-        """Return the depth of a footprint's overlap with map and obstacles (m); 0 without contact."""
+        """Return the depth of a footprint's overlap with the map and the obstacles (m); 0 without contact."""
         return self.overlap(self._occupied, box) + sum(penetration(box, obstacle) for obstacle in self._obstacles)
 
     def overlap(self, solid: NDArray[np.bool_], box: Box) -> float:
@@ -171,16 +171,16 @@ class Surroundings:
         return depth
 
     def moving_overlap(self, box: Box, name: str) -> float:
-        """Return the depth of overlap of the robot ``name``'s footprint with other robots and people (m)."""
+        """Return how deep the footprint of the robot ``name`` overlaps other robots and people (m)."""
         return sum(depth for _, _, depth in self._met(box, name))
 
     def report(self, box: Box, name: str, speed: float) -> None:
-        """Report a contact of the robot ``name`` with the bodies that block its move to ``box``."""
+        """Report contacts of the robot ``name`` with the bodies that block its move to ``box``."""
         for other, pace, _ in self._met(box, name):
             self._contact(name, other, speed, pace)
 
     def _met(self, box: Box, name: str) -> list[tuple[str, float, float]]:
-        """Return name, speed and penetration of every body that a footprint overlaps."""
+        """Return the name, speed and penetration depth of every body that a footprint overlaps."""
         found = []
         size = hypot(box.length, box.width) / 2
         for body in self.bodies:
@@ -206,7 +206,7 @@ class Surroundings:
         self.on_contact(contact)
 
     def _part(self) -> None:
-        """Forget pairs of bodies that have separated: their next contact is a new one."""
+        """Forget pairs of bodies that have separated, so that their next contact is reported again."""
         for pair in sorted(self._touching):
             # 0.08: minimum distance of bodies that have parted, m: more than a stride
             first, second = (self._shape(name, 2 * 0.08) for name in pair)
@@ -246,7 +246,7 @@ class Surroundings:
     # Sight
 
     def people_at(self, time_ns: int) -> list[tuple[float, float, float]]:
-        """Return x, y and radius (m) of every person at an instant within the last half second."""
+        """Return x, y and radius (m) of every person at a time within the last half second."""
         elapsed = np.array([float(time_ns - (self._start_ns or 0))])
         found = [(person.places(elapsed)[:, 0].tolist(), person.radius) for person in self.people]
         return [(x, y, radius) for (x, y), radius in found]
@@ -267,7 +267,8 @@ class Surroundings:
             ys: (n,) as ``xs``.
             angles: (n,) directions in the map frame (rad).
             reach: maximum distance (m).
-            times_ns: (n,) times of the rays, increasing: they hit moving bodies where these were then; None: now.
+            times_ns: (n,) times of the rays, increasing: moving bodies are hit where they were at that time; None for
+                the current time.
             without: name of the robot with the sensor.
         """
         others = [body for body in self.bodies if body.name != without]

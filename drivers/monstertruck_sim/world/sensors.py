@@ -1,4 +1,4 @@
-"""Physics of the sensing elements, for the emulators."""
+"""Physics of the sensors, for the emulators."""
 
 from collections.abc import Callable
 from math import atan2, degrees, hypot, pi, radians
@@ -58,24 +58,24 @@ LEVEL_BEAMS: Beams = np.cos(BEAM_ANGLES), np.sin(BEAM_ANGLES), np.zeros(SWEEP_ST
 
 
 class Sweep(Protocol):
-    """Beams of a lidar through the world."""
+    """Casts a lidar's beams through the world."""
 
     def __call__(self, poses: Array, beams: Beams | None, times_ns: NDArray[np.int64], reach: float, /) -> Array:
         """Ranges (m); inf without a return.
 
         Args:
-            poses: poses of the robot at the beams' instants, (6, n): x, y, yaw, pitch, roll, height.
-            beams: directions in the body frame; None: ``BEAM_ANGLES`` in the body's plane.
-            times_ns: instants of the beams, (n,), rising.
+            poses: robot poses at the beam times, (6, n): x, y, yaw, pitch, roll, height.
+            beams: directions in the body frame; None for ``BEAM_ANGLES`` in the body's plane.
+            times_ns: beam times, (n,), increasing.
             reach: maximum horizontal distance (m).
         """
 
 
 class UnevenGround(Protocol):
-    """Ground with a height."""
+    """Ground whose height varies."""
 
     def height(self, x: Array, y: Array) -> Array:
-        """Return the heights at points in the map frame (m); all arrays have one shape."""
+        """Return the heights at points in the map frame (m); all arrays have the same shape."""
 
     def cast(self, xs: Array, ys: Array, zs: Array, headings: Array, rises: Array, reach: float) -> Array:
         """Return horizontal distances along beams from points, all of shape (n,); inf beyond ``reach``."""
@@ -84,13 +84,13 @@ class UnevenGround(Protocol):
 class PlaneSweep:
     """Beams over a plane with upright walls, or over uneven ground.
 
-    A beam hits the ground, hits a wall, or passes over walls of finite height. The height of the mount above the ground
-    is the same as on level ground.
+    A beam hits the ground, hits a wall, or passes over walls of finite height. The mount's height above the ground is
+    taken to be the same as on level ground.
 
     Args:
-        cast: ranges to the walls.
-        terrain: the ground; None: level.
-        config: configuration of the lidar.
+        cast: casts rays to the walls.
+        terrain: the ground; None if it is level.
+        config: lidar configuration.
     """
 
     def __init__(self, cast: Caster, terrain: Terrain | None, config: LidarConfig) -> None:
@@ -128,7 +128,7 @@ class PlaneSweep:
         return nearest
 
     def _over(self, terrain: Terrain, poses: Array, beams: Beams, times_ns: NDArray[np.int64], reach: float) -> Array:
-        """Return ranges over uneven ground; see ``_tilted`` for the arguments."""
+        """Return ranges over uneven ground; the arguments are those of ``_tilted``."""
         config, (x, y, yaw, pitch, *_) = self._config, poses
         xs, ys = self._places(x, y, yaw)
         zs = terrain.height(x, y) - config.x * np.sin(pitch) + config.height
@@ -145,16 +145,16 @@ def over(
     times_ns: NDArray[np.int64],
     reach: float,
 ) -> Array:
-    """Return ranges over uneven ground, to the ground and the walls on it (m); inf without a return.
+    """Return ranges to uneven ground and the walls on it (m); inf without a return.
 
     Args:
         cast: horizontal ranges to the walls.
         ground: the ground.
-        config: configuration of the lidar.
-        origins: origins of the beams in the map frame (m).
+        config: lidar configuration.
+        origins: beam origins in the map frame (m).
         yaw: yaw of the robot, (n,).
         beams: directions in the robot's level frame.
-        times_ns: instants of the beams.
+        times_ns: beam times.
         reach: maximum horizontal distance (m).
     """
     (xs, ys, zs), (forward, left, up) = origins, beams
@@ -173,14 +173,14 @@ def over(
 class SimulatedLidar:
     """``ScannedRoom``: every beam starts at the truck's pose at the time of that beam.
 
-    Noise is Gaussian with the data sheet's bound at two standard deviations, as a manufacturer's accuracy covers nearly
-    all readings. The joints of a mount turn the lidar about the mount's centre.
+    Noise is Gaussian, with two standard deviations equal to the data sheet's bound, because a manufacturer's accuracy
+    figure covers nearly all readings. The joints of a mount turn the lidar about the mount's centre.
 
     Args:
-        plant: carrier of the sensor.
+        plant: the robot that carries the sensor.
         sweep: ranges along the beams.
         config: true parameters.
-        seed: seed of the noise; None: no noise.
+        seed: noise seed; None for no noise.
     """
 
     def __init__(self, plant: Plant, sweep: Sweep, config: LidarConfig, seed: int | None) -> None:
@@ -224,7 +224,7 @@ class SimulatedLidar:
         return sheet._replace(least=least, greatest=config.max_range or sheet.greatest)
 
     def _cast(self, mounted: Beams | None, level: Beams, times: NDArray[np.int64], reach: float) -> Array:
-        """Return the true ranges, (n,) (m), of beams in the frame of the lidar's carrier; None: ``LEVEL_BEAMS``."""
+        """Return the true ranges (m), (n,), of beams in the frame of the lidar's carrier; None for ``LEVEL_BEAMS``."""
         poses, beams = self._plant.poses(times), mounted
         if self.joints is not None:
             beams = turned(level if beams is None else beams, *self.joints.angles(times))
@@ -240,7 +240,7 @@ class SimulatedLidar:
         return np.where(np.isfinite(ranges), sigma, 0.0)
 
     def _held(self, board: FlatPanel, pose: Array, beams: Beams) -> Array:
-        """Return the ranges of a board in front of a robot at rest (m); inf without a return."""
+        """Return the ranges to a board in front of a robot at rest (m); inf without a return."""
         x, y, yaw, pitch, roll, height = pose.tolist()
         body, config = rotation(yaw, pitch, roll), self._config
         origin = np.array((x, y, height)) + body @ np.array((config.x, config.y, config.height))
@@ -261,7 +261,7 @@ class SimulatedLidar:
 
 
 class SimulatedMotor:
-    """``MotorPlant`` of one driven shaft, with the controller's sign."""
+    """``MotorPlant`` for one driven shaft, with the controller's sign."""
 
     def __init__(self, plant: Plant, config: MotorConfig, seed: int | None, shaft: int = 0) -> None:
         self._plant, self._config, self._shaft = plant, config, shaft
@@ -269,7 +269,7 @@ class SimulatedMotor:
         self._sign = -1.0 if config.inverted else 1.0
 
     def command(self, time_ns: int, target_rpm: float | None, accel_rpm_s: float) -> None:
-        """Ramp towards ``target_rpm`` from ``time_ns`` on; None: power stage off, coasting."""
+        """Ramp towards ``target_rpm``, starting at ``time_ns``; None switches the power stage off (coasting)."""
         self._plant.advance(time_ns)
         self._plant.shafts[self._shaft].command(None if target_rpm is None else self._sign * target_rpm, accel_rpm_s)
 
@@ -302,7 +302,7 @@ class SimulatedServos:
 
     @property
     def inputs(self) -> frozenset[int]:
-        """Analog inputs of the battery's voltage and current."""
+        """Analog inputs for battery voltage and current."""
         current = self._config.current_channel
         return frozenset({self._config.channel, *(() if current is None else (current,))})
 
@@ -315,7 +315,7 @@ class SimulatedServos:
         self._plant.advance(time_ns)
 
     def analog_volts(self, channel: int, time_ns: int) -> float:
-        """Return the voltage at an analog input; 0 except at the inputs of battery voltage and current."""
+        """Return the voltage at an analog input; 0 except at the inputs for battery voltage and current."""
         config, battery = self._config, self._plant.battery
         if channel not in (config.channel, config.current_channel):
             return 0.0
@@ -333,8 +333,8 @@ class SimulatedCompass:
 
     The accelerometer measures the reaction to gravity and to the body's own acceleration, from which the compass
     computes pitch and roll. The level field is rotated by the deviation curve and noise, tilted with the body, and
-    distorted by the truck's iron and the motor's current. The heading is compensated with the true tilt: heading errors
-    of an accelerating body are not modelled.
+    distorted by the truck's iron and the motor's current. The heading is compensated using the true tilt: heading
+    errors caused by acceleration are not modelled.
     """
 
     def __init__(self, plant: Plant, config: CompassModelConfig, seed: int | None) -> None:
@@ -349,7 +349,7 @@ class SimulatedCompass:
             self._deviation = radians(config.deviation_deg)
 
     def deviation(self, heading: float) -> float:
-        """Return the fixed heading error (rad): a one-cycle and a two-cycle wave, within the configured amplitude."""
+        """Return the fixed heading error (rad): a one-cycle and a two-cycle wave within the configured amplitude."""
         one, two = heading + self._phases[0], 2 * heading + self._phases[1]
         return self._deviation * (0.6 * sin(one) + 0.4 * sin(two))
 
@@ -395,8 +395,8 @@ class SimulatedCompass:
 class SimulatedImu:
     """``ImuSource``: gyroscopes and accelerometers at the geometric centre, axes x forward, y left, z up.
 
-    They measure the body's rotation (in the plane: its yaw rate), and gravity and the body's own acceleration, rotated
-    by the tilt.
+    The sensors measure the body's rotation (only its yaw rate in the plane engine), and gravity and the body's
+    acceleration, rotated by the tilt.
     """
 
     def __init__(self, plant: Plant, config: ImuModelConfig, seed: int | None) -> None:
@@ -432,7 +432,7 @@ class SimulatedRearWheels:
     """``WheelSource``: the wheels of the rear axle roll with the robot's motion, independently of the driven wheel.
 
     Args:
-        plant: physics of the robot.
+        plant: the robot's physics.
         config: track and radius.
     """
 
@@ -453,7 +453,7 @@ class SimulatedRearWheels:
         return self._rolled[0] / self._radius, self._rolled[1] / self._radius
 
     def _roll(self, before: Pose2, now: Pose2, dt: int) -> None:
-        """Add the rotation along an arc; skip it if the robot was carried."""
+        """Add the wheel rotation along an arc; skip it if the robot was carried."""
         way = hypot(now[0] - before[0], now[1] - before[1])
         if way > 5.0 * dt / SECOND:  # maximum speed between two samples of a robot that was not carried, m/s
             return
@@ -465,17 +465,17 @@ class SimulatedRearWheels:
 
 
 def turned(vector: tuple[Real, Real, Real], pitch: Real, roll: Real) -> tuple[Real, Real, Real]:
-    """Apply the inverse of ``_to_body`` to one vector, or to many with individual angles."""
+    """Apply the inverse of ``_to_body`` to one vector, or to many vectors with individual angles."""
     x, y, z = vector
     y, z = cos(roll) * y - sin(roll) * z, sin(roll) * y + cos(roll) * z
     return cos(pitch) * x + sin(pitch) * z, y, cos(pitch) * z - sin(pitch) * x
 
 
 def _mounted(config: LidarConfig, level: Beams) -> Beams | None:
-    """Return the beams of a lidar in the frame of its carrier; None if it is mounted straight.
+    """Return the beams of a lidar in the frame of its carrier; None if the lidar is mounted without rotation.
 
     Args:
-        config: mount of the lidar.
+        config: the lidar's mount.
         level: the beams in the lidar's own frame.
     """
     if config.yaw == config.pitch == config.roll == 0.0:

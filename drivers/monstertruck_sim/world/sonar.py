@@ -1,9 +1,9 @@
 """Sonar model: pure functions of the surrounding walls, for emulators and for studies without a daemon.
 
-``beam`` is the range along the axis. ``cone`` samples the cone by rays and uses the nearest point that returns sound: a
-wall if its normal is within the critical angle of the direction to the sonar, an edge or a corner in every direction.
-Sound from another sonar arrives in the same manner, over a longer or shorter path, shifted by the difference in send
-time: a sonar cannot identify the source of a sound (after Kuc and Siegel, "Physically Based Simulation Model for
+``beam`` is the range along the axis. ``cone`` samples the cone with rays and uses the nearest point that returns sound:
+a wall if its normal is within the critical angle of the direction to the sonar, an edge or a corner in every direction.
+Sound from another sonar arrives in the same way, over a longer or shorter path, shifted by the difference between the
+send times: a sonar cannot identify the source of a sound (after Kuc and Siegel, "Physically Based Simulation Model for
 Acoustic Sensor Robot Navigation", 1987; Borenstein and Koren, "Error Eliminating Rapid Ultrasonic Firing", 1995).
 """
 
@@ -33,7 +33,7 @@ and height (m).
 
 
 class Ping(NamedTuple):
-    """Ping of a sonar: position (m) and direction (rad) in the map frame, time (s)."""
+    """A sonar ping: position (m) and direction (rad) in the map frame, and time (s)."""
 
     x: float
     y: float
@@ -80,7 +80,7 @@ def surface(cast: Caster, ping: Ping, model: SonarModelConfig) -> Surface:
 
 
 def leaning(cast: Caster, yaw: float, pitch: float, roll: float, over: float) -> Caster:
-    """Return a caster for rays that tilt with a body; it measures along them.
+    """Return a caster for rays that tilt with a body; it measures ranges along the tilted rays.
 
     The ground gives no echo, because its angle of incidence is too flat.
 
@@ -89,7 +89,7 @@ def leaning(cast: Caster, yaw: float, pitch: float, roll: float, over: float) ->
         yaw: yaw of the body in the map frame (rad).
         pitch: pitch of the body, nose down positive (rad).
         roll: roll of the body, right side down positive (rad).
-        over: height of the walls above the sonars (m); sound above it passes.
+        over: height of the walls above the sonars (m); sound passes over the walls above this height.
     """
     if pitch == 0.0 and roll == 0.0:
         return cast
@@ -120,7 +120,7 @@ def cone(surfaces: Sequence[Surface], listener: Ping, model: SonarModelConfig) -
     """Return the nearest echo that ``listener`` takes for its own (m); inf if none is within ``range_max``.
 
     Args:
-        surfaces: surfaces of every sonar that sent anything since the last sound died away, including ``listener``.
+        surfaces: surfaces for every sonar that has sent a ping whose sound has not yet decayed, including ``listener``.
         listener: position, axis and send time of the listening sonar.
         model: settings.
     """
@@ -145,7 +145,7 @@ def heard(distance: float, model: SonarModelConfig, noise: np.random.Generator |
 
 
 def _normals(x: Array, y: Array, ranges: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the direction of the wall's normal at every point, by principal axes of its neighbours, and the edges."""
+    """Return the wall normal's direction at every point, from the principal axes of its neighbours, and the edges."""
     count = len(ranges)
     near, far = np.minimum(ranges[1:], ranges[:-1]), np.maximum(ranges[1:], ranges[:-1])
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -175,7 +175,7 @@ def _normals(x: Array, y: Array, ranges: Array) -> tuple[Array, NDArray[np.bool_
 
 
 def _arrival(found: Surface, listener: Ping, model: SonarModelConfig) -> float:
-    """Return the range that ``listener`` reports for the sound of one ping; inf if it hears none."""
+    """Return the range that ``listener`` reports for the sound of one ping; inf if no sound reaches it."""
     sent = found.ping
     own = sent == listener
     if not own and not model.cross_talk:
@@ -195,7 +195,7 @@ def _arrival(found: Surface, listener: Ping, model: SonarModelConfig) -> float:
 
 
 def _turn(angles: Array) -> Array:
-    """Angles in [-pi, pi)."""
+    """Wrap angles to [-pi, pi)."""
     turned: Array = (angles + pi) % (2 * pi) - pi
     return turned
 
@@ -204,10 +204,10 @@ class SimulatedSonars:
     """``SonarSource``: every ping starts at the body's current pose, and all other sonars detect it until it decays.
 
     Args:
-        plant: the robot that carries the sonars; they lean with it.
-        cast: ranges to the walls.
+        plant: the robot that carries the sonars, which tilt with it.
+        cast: casts rays to the walls.
         config: true parameters.
-        seed: seed of the noise, or None for no noise.
+        seed: noise seed, or None for no noise.
         wall_height: height of the walls above the ground (m).
         solids: objects that sonars detect in addition to the walls, or None.
     """
@@ -231,7 +231,7 @@ class SimulatedSonars:
         """Send a ping.
 
         Raises:
-            InputError: the robot has no sonar of that name.
+            InputError: the robot has no sonar with that name.
         """
         place = self._config.sonars.get(name)
         if place is None:
@@ -245,7 +245,7 @@ class SimulatedSonars:
         self._pings.append((name, ping, cast, found))
 
     def range(self, name: str) -> float:
-        """Return the distance of the latest ping of a sonar (m) once the echo is back; inf without an echo."""
+        """Return the distance measured by a sonar's latest ping (m) once the echo has returned; inf without an echo."""
         newest = next(((ping, cast) for fired, ping, cast, _ in reversed(self._pings) if fired == name), None)
         if newest is None:
             return inf

@@ -1,4 +1,4 @@
-"""Terrain: ground height, beam intersections and body tilt; and a body tilt that oscillates."""
+"""Terrain: ground height, beam intersections and the resulting body tilt; also an oscillating tilt."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -16,10 +16,10 @@ from monstertruck_sim.world.config import RoughPatch, SinusoidTilt
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """Height of the ground along x, the same for every y, by linear interpolation between points.
+    """Ground height along x, the same for every y, interpolated linearly between points.
 
     Args:
-        points: (x, z) in the map frame, m, x rising; constant beyond the ends.
+        points: (x, z) in the map frame (m), with increasing x; the height is constant beyond the ends.
     """
 
     points: tuple[tuple[float, float], ...]
@@ -33,7 +33,7 @@ LEVEL = Profile(((0.0, 0.0), (1.0, 0.0)))
 
 
 class Terrain:
-    """Height of the ground over the plane.
+    """Ground height over the plane.
 
     Args:
         profile: profile along x.
@@ -44,7 +44,7 @@ class Terrain:
         self._profile, self._patches = profile, patches
 
     def height(self, x: Array, y: Array) -> Array:
-        """Return the heights at points in the map frame (m); all arrays have one shape."""
+        """Return the heights at points in the map frame (m); all arrays have the same shape."""
         z = self._profile.height(x)
         for patch in self._patches:
             dx, dy = x - patch.x, y - patch.y
@@ -61,10 +61,10 @@ class Terrain:
         return -atan((fl + fr - rl - rr) / 2 / wheelbase), atan((fl + rl - fr - rr) / 2 / track)
 
     def cast(self, xs: Array, ys: Array, zs: Array, headings: Array, rises: Array, reach: float) -> Array:
-        """Return the horizontal distances of the beams' hits on the ground; inf without a hit within ``reach``.
+        """Return the horizontal distances at which beams hit the ground; inf without a hit within ``reach``.
 
         Args:
-            xs: origins, (n,) (m).
+            xs: x of the origins, (n,) (m).
             ys: y of the origins.
             zs: z of the origins.
             headings: directions in the plane, (n,) (rad).
@@ -85,7 +85,7 @@ class Terrain:
 
 
 def rocking(config: SinusoidTilt, elapsed_ns: int) -> tuple[float, float]:
-    """Return pitch and roll ``elapsed_ns`` after the world's start (rad)."""
+    """Return pitch and roll (rad) ``elapsed_ns`` after the start of the world."""
     phase = 2 * pi * config.frequency * elapsed_ns * 1e-9
     return radians(config.pitch_deg) * sin(phase), -radians(config.roll_deg) * cos(phase)
 
@@ -99,7 +99,7 @@ def load_profile(path: Path) -> Profile:
     """Read ``points: [[x, z], ...]``.
 
     Raises:
-        InputError: the file is invalid; the text names file and key.
+        InputError: the file is invalid; the message names the file and the key.
     """
     keys = read_yaml(path)
     points: Any = keys.get("points") if isinstance(keys, dict) else None
@@ -113,5 +113,5 @@ def load_profile(path: Path) -> Profile:
 
 
 def save_profile(profile: Profile, path: Path) -> None:
-    """Write the file format of ``load_profile``."""
+    """Write a file that ``load_profile`` can read."""
     path.write_text(yaml_text({"points": [list(p) for p in profile.points]}), encoding="utf-8")

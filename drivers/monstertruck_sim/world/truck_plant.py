@@ -1,7 +1,7 @@
 """The truck in the plane: motors, clutches, steering, tyres, body, battery; integrated lazily on a fixed grid.
 
 Steps are 5 ms: a quarter of the fastest lag (which is integrated exactly), a quarter of a servo frame, and short enough
-that at 0.22 m/s a body point moves less than 2 mm, so a test of the footprint after each step misses no cell. A step
+that at 0.22 m/s a body point moves less than 2 mm, so that testing the footprint after each step misses no cell. A step
 ends early at the requested instant; the time grid itself never shifts.
 """
 
@@ -35,10 +35,10 @@ class TruckPlant(Plant):
     Args:
         config: true parameters.
         battery: battery model parameters.
-        start: pose of the geometric centre.
+        start: initial pose of the geometric centre.
         contact: collision test.
         tilt: ground under the truck.
-        seed: seed of the slip noise, or None for no noise.
+        seed: seed for the slip noise, or None for no noise.
     """
 
     STEP_NS: ClassVar[int] = STEP_NS
@@ -72,7 +72,7 @@ class TruckPlant(Plant):
 
     @property
     def acceleration(self) -> Xyz:
-        """Acceleration of the body without gravity, as sensed on it: forward, left, up in its level frame (m/s^2)."""
+        """Acceleration without gravity, as sensed on the body: forward, left, up in its level frame (m/s^2)."""
         return *self._felt, 0.0
 
     @property
@@ -102,7 +102,7 @@ class TruckPlant(Plant):
         self._draw(dt, self._pulls)
 
     def _drive(self, i: int, shaft: Shaft, dt: float) -> None:
-        """Let the wheels follow their motor, within the force that the clutch can transmit."""
+        """Let the wheels follow their motor within the force that the clutch can transmit."""
         motor, speed = self.config.motor, self._wheel_speeds[i]
         wanted = self._chassis.drivetrain.speed(shaft.rpm * RPM)
         rolling = self._rolling * min(max(speed / 0.01, -1.0), 1.0)
@@ -169,7 +169,7 @@ class TruckPlant(Plant):
         self._attitude = self._tilt(self._elapsed, *self._pose)
 
     def _hold_wheels(self) -> None:
-        """Stop the wheels of a blocked body: its motors keep turning and wind up until their clutches slip."""
+        """Stop the wheels of a blocked body: the motors keep turning and wind up until their clutches slip."""
         for i, speed in enumerate(self._wheel_speeds):
             if speed:
                 self._pulls[i], self._slipping[i] = copysign(self.config.motor.clutch_force, speed), True
@@ -177,10 +177,10 @@ class TruckPlant(Plant):
 
 
 class _Steering:
-    """Steering angles behind the linkage, and speed of the body per speed of the wheels; recomputed on change.
+    """Steering angles after the linkage, and body speed per wheel speed; recomputed on change.
 
-    The truck's one motor drives four wheels through open differentials: it turns at the mean of the wheel speeds that
-    the body's motion imposes, each along its own angle.
+    The truck's one motor drives four wheels through open differentials: it turns at the mean of the wheel speeds
+    imposed by the body's motion, each along its own steering angle.
     """
 
     def __init__(self, chassis: Chassis) -> None:
@@ -209,13 +209,13 @@ def _tyres(config: SimTruckConfig, chassis: Chassis) -> SingleTrack | None:
 class SkidEffects:
     """Skid-steer effects beyond the kinematic model: unequal wheels, a turn at each reversal, a slow slide.
 
-    The skid-steer paper observed all three effects: its robot curved within a pass although its motors had equal
-    commands, turned a little at every reversal, and its circles wandered. Parameters such as turning centres and
-    effective radii belong to the body. Every draw is a function of seed and number of the reversal.
+    The skid-steer paper observed all three effects: the robot curved within a pass although its motors had equal
+    commands, it turned slightly at every reversal, and its circles drifted. Parameters such as turning centres and
+    effective radii belong to the body. Every draw is a function of the seed and the number of the reversal.
 
     Args:
-        config: its parameters.
-        seed: seed of the turns at reversals; None makes every reversal turn by the mean.
+        config: parameters of the effects.
+        seed: seed for the turns at reversals; None makes every reversal turn by the mean.
     """
 
     def __init__(self, config: SkidModelConfig, seed: int | None) -> None:

@@ -44,20 +44,21 @@ log = logging.getLogger(__name__)
 
 
 class World:
-    """One robot in its surroundings, with its sensors; it advances when a later instant is requested.
+    """One robot in its surroundings, with its sensors; it advances when a later time is requested.
 
-    The state is a function of configuration, seed, commands and command times. Time starts at the first instant
-    requested.
+    The state is a function of the configuration, the seed, the commands and their times. Time starts at the first
+    requested time.
 
     Args:
         config: see ``WorldConfig``.
-        seed: seed of all noise.
+        seed: seed for all noise.
         scene: surroundings shared with other robots, or None to build them from ``config``.
-        name: name of the robot.
+        name: robot name.
         lidar: whether the robot carries a lidar; its weight matters in the rigid-body engine.
 
     Raises:
-        InputError: unknown map name, a bad map or profile file, or a start pose in a wall, a robot or a person.
+        InputError: the map name is unknown, a map or profile file is invalid, or the start pose is in a wall, a robot
+            or a person.
     """
 
     def __init__(
@@ -108,12 +109,12 @@ class World:
         self.wheels: WheelSource = SimulatedRearWheels(self._plant, config.truck)
 
     def battery_volts(self, time_ns: int) -> float:
-        """Return the voltage behind the battery's divider."""
+        """Return the output voltage of the battery divider."""
         return self.servos.analog_volts(self._battery_input, time_ns)
 
     @property
     def plant(self) -> Plant:
-        """Physics of the robot."""
+        """The robot's physics."""
         return self._plant
 
     @property
@@ -130,19 +131,19 @@ class World:
 
     @property
     def pace(self) -> float:
-        """Latest speed of the fastest point of the footprint (m/s)."""
+        """Latest speed of the footprint's fastest point (m/s)."""
         return self._footprint.pace(self._plant.twist)
 
     def integrate(self, time_ns: int) -> None:
-        """Integrate this robot alone up to an instant."""
+        """Integrate this robot alone up to a time."""
         self._plant.integrate(time_ns)
 
     def outlines(self, times_ns: NDArray[np.int64]) -> list[Box]:
-        """Return the footprints at instants within the last half second."""
+        """Return the footprints at times within the last half second."""
         return [self._footprint.box((x, y, yaw)) for x, y, yaw in self._plant.poses(times_ns)[:3].T.tolist()]
 
     def truth(self, time_ns: int) -> TruthState:
-        """Return the ground truth at ``time_ns``, or at the latest instant requested if that is later."""
+        """Return the ground truth at ``time_ns``, or at the latest requested time if that is later."""
         self._plant.advance(time_ns)
         return self._plant.truth()
 
@@ -159,7 +160,7 @@ class World:
         return self._plant.mount_torque(joint)
 
     def is_free(self, pose: Pose2) -> bool:
-        """Return whether ``pose`` is collision-free: x, y (m) and yaw (rad) in the map frame."""
+        """Whether ``pose`` is collision-free: x, y (m) and yaw (rad) in the map frame."""
         solid = self.scene.overlap(self.scene.solid, self._footprint.box(pose))
         return bool(solid + self._space.contact(*pose) <= 0)
 
@@ -189,7 +190,7 @@ class World:
         self._space.remove(obstacle)
 
     def set_charge(self, time_ns: int, charge: float) -> None:
-        """Replace the battery with one at state of charge ``charge`` (0..1)."""
+        """Replace the battery with one whose state of charge is ``charge`` (0..1)."""
         self._plant.advance(time_ns)
         self._plant.battery.set_charge(charge)
 
@@ -199,7 +200,7 @@ class World:
         self._plant.battery.connected = connected
 
     def supply_servos(self, time_ns: int, *, on: bool) -> None:
-        """Switch the 5 V supply of the steering servos; without it they hold their position."""
+        """Switch the 5 V supply of the steering servos, which hold their position without it."""
         self._plant.advance(time_ns)
         self._plant.servo_supply = on
 
@@ -214,11 +215,11 @@ class World:
         self._plant.shafts[shaft].blocked = on
 
     def shaft_blocked(self, shaft: int = 0) -> bool:
-        """Return whether a driven shaft is blocked."""
+        """Whether a driven shaft is blocked."""
         return self._plant.shafts[shaft].blocked
 
     def set_tilt(self, time_ns: int, tilt: TiltConfig) -> None:
-        """Set the tilt of the truck from now on."""
+        """Change the truck's tilt."""
         self._plant.advance(time_ns)
         self._space.set_tilt(tilt)
 
@@ -265,12 +266,12 @@ def make_scene(config: WorldConfig, seed: int, others: Sequence[WorldConfig] = (
     """Create the surroundings for the robots of one world.
 
     Args:
-        config: world of the first robot; defines the map and the people.
-        seed: seed of the people.
-        others: worlds of the other robots, for their start poses.
+        config: world of the first robot, which defines the map and the people.
+        seed: seed for the people.
+        others: worlds of the other robots, which define their start poses.
 
     Raises:
-        InputError: unknown map name, bad map or profile file, or a person's path is not free.
+        InputError: the map name is unknown, a map or profile file is invalid, or a person's path is not free.
     """
     place = _find(config.map)
     return Surroundings(place, config.people, seed, [_start(each, place) for each in (config, *others)])
@@ -282,7 +283,7 @@ def _start(config: WorldConfig, place: BuiltIn) -> Pose2:
 
 
 def _find(name: str) -> BuiltIn:
-    """Return a built-in world, or load the map file at that path with the ground profile in the same folder."""
+    """Return a built-in world, or load the map file at that path and the ground profile in the same folder."""
     if name in BUILT_IN:
         return BUILT_IN[name]()
     path = Path(name)

@@ -14,14 +14,14 @@ from monstertruck_sim.world3d.plant import RigidPlant
 
 
 class RenderedView(SimulatedView):
-    """``ViewSource`` of a robot of rigid bodies; ``SimulatedView`` provides everything in the plane.
+    """``ViewSource`` for a rigid-body robot; ``SimulatedView`` provides all that is computed in the plane.
 
     Args:
-        drawn: equivalent camera in the plane.
+        drawn: the equivalent camera in the plane.
 
     Raises:
         NotInstalledError: this computer has no EGL.
-        InputError: the robot has no rigid bodies.
+        InputError: the robot is not made of rigid bodies.
     """
 
     HIDDEN: tuple[Group, ...] = (Group.ROBOT,)
@@ -40,7 +40,7 @@ class RenderedView(SimulatedView):
         weakref.finalize(self, _close, self._thread, self._renderers).atexit = False
 
     def exposure(self, time_ns: int, size: tuple[int, int]) -> Drawing:
-        """``ViewSource`` that copies the world's state at once and renders when called."""
+        """Copy the world's state now, and render the image when the result is called."""
         self._rigid.advance(time_ns)
         renderer, wider, painter = self._renderer(size)
         place = self._place(time_ns)
@@ -76,7 +76,7 @@ class RenderedView(SimulatedView):
 
 
 def _bent(picture: Picture, wider: float, painter: Painter) -> Picture:
-    """Distort a picture by the lens: each pixel is taken from its position in the undistorted picture."""
+    """Apply the lens distortion: each pixel is taken from its position in the undistorted picture."""
     if wider == 1.0:
         return picture
     import cv2  # noqa: PLC0415  # the library of an extra

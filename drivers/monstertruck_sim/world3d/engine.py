@@ -1,8 +1,8 @@
 """The engine ``mujoco``: one robot of rigid bodies in the surroundings shared by all engines.
 
 Walls, ground and all moving bodies are in MuJoCo's model for contact. Sensor rays are cast on the same map and heights
-by the project's own kernels: MuJoCo's rays cost 0.9 ms per scan against 400 boxes and 0.3 s against a field of 400 x
-400 heights. MuJoCo's rays are used only for blocks on the ground, which those kernels do not model.
+using the project's own kernels: MuJoCo's rays cost 0.9 ms per scan against 400 boxes and 0.3 s against a 400 x 400
+height field. MuJoCo's rays are used only for blocks on the ground, which those kernels do not model.
 """
 
 from functools import partial
@@ -63,10 +63,10 @@ class RigidSpace(Space):
     """``Space`` of rigid bodies; spare bodies represent obstacles, people and other robots.
 
     Args:
-        footprint: footprint of the robot, in its surroundings.
-        plant: the robot in its model.
+        footprint: the robot's footprint in its surroundings.
+        plant: the robot in its MuJoCo model.
         ground: the ground.
-        name: name of the robot.
+        name: robot name.
     """
 
     def __init__(self, footprint: PlanOutline, plant: RigidPlant, ground: UnevenGround, name: str) -> None:
@@ -82,7 +82,7 @@ class RigidSpace(Space):
         """Add an obstacle.
 
         Raises:
-            InputError: no spare body of its kind is left.
+            InputError: no spare body of the obstacle's kind is left.
         """
         kind, people = type(obstacle), [person.disc for person in self._scene.people]
         robots = [body.outline for body in self._others()]
@@ -96,7 +96,7 @@ class RigidSpace(Space):
         """Put the robot onto blocks, or back onto the ground.
 
         Raises:
-            InputError: the tilt oscillates, or the robot cannot stand at it.
+            InputError: the tilt oscillates, or the robot cannot stand at this tilt.
         """
         if tilt.kind == "sinusoid":
             raise InputError("tilt sinusoid: not supported with engine mujoco; expected ground or steady")
@@ -153,13 +153,13 @@ class RigidSpace(Space):
 
 
 class RigidSweep:
-    """Beams over the ground, against walls and against blocks; the mount moves with the body.
+    """Casts beams against ground, walls and blocks; the mount moves with the body.
 
     Args:
-        plant: the robot, in its model.
+        plant: the robot in its MuJoCo model.
         cast: horizontal ranges to walls, obstacles, people and robots.
         ground: the ground.
-        config: configuration of the lidar.
+        config: lidar configuration.
     """
 
     def __init__(self, plant: RigidPlant, cast: Caster, ground: UnevenGround, config: LidarConfig) -> None:
@@ -185,11 +185,11 @@ class RigidSweep:
 
 
 class RigidEchoes:
-    """``Solids``: blocks on the ground, for the rays of sonars that tilt with the body.
+    """``Solids``: blocks on the ground, for the rays from sonars that tilt with the body.
 
     Args:
-        plant: the robot, in its model.
-        height: height of the sonars over the ground (m).
+        plant: the robot in its MuJoCo model.
+        height: height of the sonars above the ground (m).
     """
 
     def __init__(self, plant: RigidPlant, height: float) -> None:
@@ -217,16 +217,16 @@ class RigidEchoes:
 
 
 def has_blocks(plant: RigidPlant) -> bool:
-    """Whether blocks are on the ground, which the kernels of walls and heights do not model."""
+    """Whether there are blocks on the ground, which the kernels for walls and heights do not model."""
     return bool((plant.model.geom_group == Group.BLOCKS).any())
 
 
 def to_blocks(plant: RigidPlant, places: Array, ways: Array, reach: float) -> Array:
-    """Return the beams' ranges to blocks on the ground by MuJoCo's rays, (n,) (m); inf without a hit within ``reach``.
+    """Return the beams' ranges (m), (n,), to blocks on the ground, using MuJoCo's rays; inf beyond ``reach``.
 
     Args:
-        plant: the robot, in its model.
-        places: origins of the beams, (n, 3) (m); neighbours in the array are neighbours in space.
+        plant: the robot in its MuJoCo model.
+        places: beam origins, (n, 3) (m); neighbours in the array are neighbours in space.
         ways: directions as unit vectors, (n, 3).
         reach: maximum distance (m).
     """
@@ -249,11 +249,11 @@ def to_blocks(plant: RigidPlant, places: Array, ways: Array, reach: float) -> Ar
 
 
 def drive_line(truck: SimTruckConfig, parts: Mechanics) -> DriveLine:
-    """Return the drive line of a body.
+    """Return a body's drive line.
 
     A truck has one motor for four wheels: open differentials in both axles and a rigid transfer case between them. A
-    car drives its rear wheels through a differential, a skid-steer robot the coupled wheels of each side or every wheel
-    separately, and a platform every wheel separately.
+    car drives its rear wheels through a differential, a skid-steer robot drives the coupled wheels on each side or
+    every wheel separately, and a platform drives every wheel separately.
 
     The wind-up is stiff enough for the wheels to follow critically damped with the mean delay ``motor.drivetrain_lag``.
     """
@@ -293,7 +293,7 @@ def wheel_steering(truck: SimTruckConfig) -> Steering:
 
 
 def rigid(config: WorldConfig, footprint: PlanOutline, start: Pose2, *, lidar: bool) -> Engine:
-    """Create a robot of rigid bodies, with or without a lidar on its joints.
+    """Create a rigid-body robot, with or without a lidar on its joints.
 
     Raises:
         InputError: a file of the world is missing or invalid, there are too many people, or the robot cannot stand at

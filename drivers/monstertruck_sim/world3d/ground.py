@@ -1,4 +1,4 @@
-"""The ground of a world: its heights on a grid, objects on it, and geometries from other MJCF files."""
+"""A world's ground: a height grid, objects on the ground, and geometries from other MJCF files."""
 
 from collections.abc import Sequence
 from math import ceil, cos, radians, sin, tan
@@ -38,13 +38,13 @@ Bounds = tuple[float, float, float, float]
 def ground_heights(
     config: WorldConfig, profile: Profile | None, bounds: Bounds, starts: Sequence[Pose2]
 ) -> HeightGrid | None:
-    """Return the sum of the map's profile, rough patches, features and height image; None: level.
+    """Return the sum of the map's profile, rough patches, features and height image; None if the ground is level.
 
     Args:
-        config: configuration of the world.
-        profile: profile of the map.
-        bounds: bounds of the map.
-        starts: start poses of all robots of the world, which share the ground.
+        config: world configuration.
+        profile: the map's profile.
+        bounds: map bounds.
+        starts: start poses of all robots in the world, which share the ground.
 
     Raises:
         InputError: the height image does not exist.
@@ -82,7 +82,7 @@ def _height(feature: GroundFeature, x: Array, y: Array, starts: Sequence[Pose2])
 
 
 def _hills(feature: Hills, x: Array, y: Array, starts: Sequence[Pose2]) -> Array:
-    """Return white noise without wavelengths below ``wavelength``, level around the starts."""
+    """Return noise without wavelengths below ``wavelength``, level around the start poses."""
     noise = generator(feature.seed, GROUND_STREAM).standard_normal(x.shape)
     spectrum = np.fft.rfft2(noise)
     fy, fx = np.fft.fftfreq(x.shape[0], HEIGHT_STEP), np.fft.rfftfreq(x.shape[1], HEIGHT_STEP)
@@ -132,14 +132,14 @@ def _standing(
 
 
 def scenery(path: Path) -> tuple[list[ET.Element], list[ET.Element]]:
-    """Read assets, and bodies and geometries, of an MJCF file; angles in radians, asset files with full paths.
+    """Read an MJCF file's assets, and its bodies and geometries; angles in radians, asset files with full paths.
 
-    Its angles are in degrees, and its asset files relative to it, unless its ``compiler`` element specifies otherwise
-    (MuJoCo XML reference, element compiler).
+    Angles in the file are in degrees and asset paths are relative to the file, unless its ``compiler`` element
+    specifies otherwise (MuJoCo XML reference, element compiler).
 
     Raises:
-        InputError: it is not an MJCF file, contains a moving body, or uses unsupported features: default classes or
-            another sequence of Euler angles.
+        InputError: the file is not an MJCF file, contains a moving body, or uses unsupported features: default classes
+            or another sequence of Euler angles.
     """
     expected = "MJCF (sim.world.mjcf)"
     text = contents(path, expected, 10 * MEGABYTE)  # bytes of an MJCF file

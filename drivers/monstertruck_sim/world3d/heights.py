@@ -1,7 +1,7 @@
-"""Height of the ground on a grid, and beam intersections with it: the triangles of MuJoCo's height field, in numba.
+"""Ground height on a grid, and beam intersections with it: the triangles of MuJoCo's height field, in numba.
 
-MuJoCo's own rays test every cell of the field below a beam's bounding box: 0.4 ms per beam on 400 x 400 points, a third
-of a second per scan. This module's rays walk along the beam from cell to cell.
+MuJoCo's own rays test every cell of the height field below a beam's bounding box: 0.4 ms per beam on 400 x 400 points,
+a third of a second per scan. This module's rays walk along the beam from cell to cell.
 """
 
 from dataclasses import dataclass
@@ -15,11 +15,11 @@ from monstertruck_kinematics.elementary import Array
 
 @dataclass(frozen=True, slots=True)
 class HeightGrid:
-    """Heights at the points of a square grid; beyond the edge, the height at the edge.
+    """Heights at the points of a square grid; beyond the grid, the height is that at its edge.
 
     Args:
         z: heights, (rows, columns), row 0 at the lowest y (m).
-        resolution: spacing of the points (m).
+        resolution: point spacing (m).
         origin: x, y of the first point (m).
     """
 
@@ -28,13 +28,13 @@ class HeightGrid:
     origin: tuple[float, float]
 
     def height(self, x: Array, y: Array) -> Array:
-        """Return the heights (m) of points in arrays of one shape."""
+        """Return the heights (m) at points; all arrays have the same shape."""
         shape = np.shape(x)
         flat = np.ravel(x).astype(np.float64), np.ravel(y).astype(np.float64)
         return np.asarray(_heights(self.z, self.resolution, *self.origin, *flat)).reshape(shape)
 
     def between(self, x0: float, y0: float, x1: float, y1: float) -> tuple[float, float]:
-        """Minimum and maximum height of the points in and around a rectangle (m)."""
+        """Return the minimum and maximum height of the grid points in and around a rectangle (m)."""
         rows, columns = self.z.shape
         first = floor((y0 - self.origin[1]) / self.resolution), floor((x0 - self.origin[0]) / self.resolution)
         last = floor((y1 - self.origin[1]) / self.resolution) + 2, floor((x1 - self.origin[0]) / self.resolution) + 2
@@ -44,10 +44,10 @@ class HeightGrid:
         return float(part.min()), float(part.max())
 
     def cast(self, xs: Array, ys: Array, zs: Array, headings: Array, rises: Array, reach: float) -> Array:
-        """Return the horizontal distances of the beams' hits on the ground; inf without a hit within ``reach``.
+        """Return the horizontal distances at which beams hit the ground; inf without a hit within ``reach``.
 
         Args:
-            xs: origins, (n,) (m).
+            xs: x of the origins, (n,) (m).
             ys: y of the origins.
             zs: z of the origins.
             headings: directions in the plane, (n,) (rad).
@@ -94,7 +94,7 @@ def _cast(
     z: Array, resolution: float, x0: float, y0: float, xs: Array, ys: Array, zs: Array, headings: Array, rises: Array,
     reach: float,
 ) -> Array:  # fmt: skip
-    """Intersect beams with the ground, whose gap to a beam is linear between two grid lines."""
+    """Intersect beams with the ground; the gap between a beam and the ground is linear between two grid lines."""
     found = np.empty(len(xs))
     top = z.max()
     for i in range(len(xs)):

@@ -1,6 +1,6 @@
-"""The MuJoCo model: MJCF of a robot, its drive line, and the ground and walls around it.
+"""The MuJoCo model: MJCF for a robot, its drive line, and the ground and walls around it.
 
-Geometries are grouped: ground, walls, blocks on the ground, the robot, and bodies that move or can be added.
+Geometries are grouped into ground, walls, blocks on the ground, the robot, and bodies that move or can be added.
 """
 
 import logging
@@ -57,7 +57,7 @@ class TouchBits(NamedTuple):
 
     @property
     def attributes(self) -> dict[str, str]:
-        """MJCF attributes of a geometry."""
+        """MJCF attributes for a geometry."""
         return {"contype": f"{self.kind}", "conaffinity": f"{self.affinity}"}
 
 
@@ -72,7 +72,7 @@ _TYRE: Final = "0.01 1"
 
 
 class Group(IntEnum):
-    """Groups of geometries."""
+    """Geometry groups."""
 
     GROUND = 0
     WALLS = 1
@@ -88,11 +88,11 @@ class DriveLine:
     """Mechanics between shafts and wheels.
 
     Args:
-        shafts: spin joints of the wheels of every driven shaft. Open differentials connect them: the shaft turns at the
+        shafts: spin joints of the wheels on every driven shaft. Open differentials connect them: the shaft turns at the
             mean speed of its wheels, and all wheels receive the same torque.
-        locked: groups of spin joints whose means turn equally (a rigid transfer case).
-        stiffness: stiffness of the wind-up between a shaft and the mean of its wheels, Nm/rad.
-        damping: damping of the wind-up (Nm s/rad).
+        locked: groups of spin joints that turn at the same mean speed (a rigid transfer case).
+        stiffness: wind-up stiffness between a shaft and the mean of its wheels (Nm/rad).
+        damping: wind-up damping (Nm s/rad).
         clutch: maximum total torque of a shaft's wheels (Nm).
         turns: turns of a spin joint per turn of its wheel, if not 1.
     """
@@ -126,9 +126,9 @@ class StaticScene:
     Args:
         walls: rectangles of solid map cells, (n, 4): minimum x, minimum y, maximum x, maximum y (m).
         wall_height: height of the walls above the ground (m).
-        heights: heights of the ground; None: level at 0.
+        heights: ground heights; None if the ground is level at 0.
         blocks: blocks on the ground.
-        scenery: assets, and bodies and geometries, of another MJCF file.
+        scenery: assets, and bodies and geometries, from another MJCF file.
         tags: tags on the walls.
         roof: tag on the robot.
     """
@@ -151,9 +151,9 @@ def rectangles(solid: NDArray[np.bool_], resolution: float, origin: tuple[float,
 
     Args:
         solid: (rows, columns), row 0 lowest y.
-        resolution: side of a cell (m).
-        origin: origin of the lower left corner (m).
-        longest: maximum side of a rectangle (cells): on uneven ground, short pieces of a wall follow it.
+        resolution: cell side (m).
+        origin: position of the lower left corner (m).
+        longest: maximum side of a rectangle (cells); short pieces of wall follow uneven ground.
     """
     left = solid.copy()
     found: list[tuple[int, int, int, int]] = []
@@ -179,12 +179,12 @@ def _first(row: NDArray[np.bool_], start: int) -> int | None:
 
 
 def mjcf(description: Description, drive: DriveLine, friction: float, scene: StaticScene) -> str:
-    """Return the whole model as MJCF text.
+    """Return the complete model as MJCF text.
 
     Args:
-        description: description of the robot; its first link moves freely.
-        drive: its drive line.
-        friction: friction coefficient of the tyres.
+        description: robot description, whose first link moves freely.
+        drive: the robot's drive line.
+        friction: tyre friction coefficient.
         scene: static surroundings.
     """
     root = Element("mujoco", model=description.name)
@@ -239,7 +239,7 @@ def load(description: Description, drive: DriveLine, friction: float, scene: Sta
     """Compile ``mjcf`` and fill in the heights.
 
     Raises:
-        InputError: the scenery of another file does not compile.
+        InputError: the scenery from another file does not compile.
     """
     mujoco.set_mju_user_warning(Warnings.take)
     try:
@@ -325,7 +325,7 @@ def _walls(world: Element, scene: StaticScene) -> None:
 
 
 def _tags(asset: Element, world: Element, tags: Sequence[TagConfig]) -> None:
-    """Add sheets of paper to the walls; ``load`` paints the tags on them."""
+    """Add sheets of paper to the walls, on which ``load`` paints the tags."""
     for i, tag in enumerate(tags):
         right, up = tag_axes(tag.yaw, lies=tag.lies)
         _paper(asset, world, f"tag_{i}", tag.size, (tag.x, tag.y, tag.z + 0.001 * tag.lies), (*right, *up))

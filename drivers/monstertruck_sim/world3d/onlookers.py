@@ -1,4 +1,4 @@
-"""Cameras in the world that are not on a robot: one that films a robot, and the ceiling cameras of a stand."""
+"""Cameras in the world that are not on a robot: one that films a robot, and a stand's ceiling cameras."""
 
 from math import cos, sin
 from pathlib import Path
@@ -28,14 +28,13 @@ _PLAIN: Final = Image.Dither.NONE
 
 
 class Film:
-    """Film of one robot; use it on the loop of a virtual clock, because a frame takes tens of milliseconds.
+    """Film of one robot; use it only on a virtual clock's loop, because a frame takes tens of milliseconds.
 
-    Use it as a context manager. The film of a run that ends with an error of the robot is kept; an interrupted run
-    leaves no file.
+    Use it as a context manager. The film is kept if the run ends with a robot error; an interrupted run leaves no file.
 
     Args:
         world: world with the robot.
-        clock: clock of the world.
+        clock: world clock.
         file: GIF file, written during the run and renamed at its end.
 
     Raises:
@@ -66,7 +65,7 @@ class Film:
             await self._clock.sleep_until(due)
 
     def take(self) -> None:
-        """Record one frame now."""
+        """Record one frame immediately."""
         now = self._clock.now()
         self._world.truth(now)
         x, y, yaw = self._plant.pose
@@ -94,13 +93,13 @@ class Film:
 
 
 class CeilingView(RenderedView):
-    """``ViewSource`` of a fixed camera in the world.
+    """``ViewSource`` for a fixed camera in the world.
 
     Args:
-        world: world of engine mujoco.
+        world: world with the mujoco engine.
         config: pose, lens and noise.
         board: board held in front of the camera, or None.
-        seed: seed of noise and board poses.
+        seed: seed for noise and board poses.
 
     Raises:
         NotInstalledError: this computer has no EGL.

@@ -21,12 +21,12 @@ Picture = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class CameraPose:
-    """Camera pose of an image.
+    """Camera pose for an image.
 
     Args:
-        place: position of the camera (m).
+        place: camera position (m).
         ahead: unit vector along the optical axis.
-        up: unit vector, perpendicular to it.
+        up: unit vector perpendicular to ``ahead``.
         field_of_view: vertical angle of view (rad).
     """
 
@@ -57,8 +57,8 @@ class WorldRenderer:
 
     Args:
         model: MuJoCo model.
-        width: width of the images (pixels).
-        height: height of the images (pixels).
+        width: image width (pixels).
+        height: image height (pixels).
 
     Raises:
         NotInstalledError: this computer has no EGL.
@@ -93,7 +93,7 @@ class WorldRenderer:
         people: Sequence[Somebody] = (),
         robots: Sequence[Plant] = (),
     ) -> Picture:
-        """Draw the world in the state of ``data``, with people and other robots."""
+        """Draw the world in the state given by ``data``, with people and other robots."""
         self.arrange(data, camera_pose, people=people, robots=robots)
         return self.render()
 
@@ -109,11 +109,11 @@ class WorldRenderer:
         """Update the scene to draw; may run in any thread.
 
         Args:
-            data: state of the world.
-            camera_pose: pose of the camera.
+            data: world state.
+            camera_pose: camera pose.
             people: people in the world.
-            robots: other robots than the model's; rigid bodies are drawn with their pose and steering.
-            hidden: omitted groups.
+            robots: robots other than the model's; rigid-body robots are drawn with their pose and steering.
+            hidden: geometry groups to omit.
         """
         self._option.geomgroup[:] = [group in list(Group) and group not in hidden for group in range(mujoco.mjNGROUP)]
         camera = mujoco.MjvCamera()
@@ -140,14 +140,14 @@ class WorldRenderer:
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = True
 
     def render(self) -> Picture:
-        """Render the scene; only in the thread that created the renderer."""
+        """Render the scene; must run in the thread that created the renderer."""
         self._gl.make_current()
         mujoco.mjr_render(self._view, self._scene, self._context)
         mujoco.mjr_readPixels(self._pixels, None, self._view, self._context)
         return self._pixels[::-1].copy()
 
     def _add_person(self, x: float, y: float, z: float, radius: float) -> None:
-        """Add legs, trunk and head of a person at a position."""
+        """Add a person's legs, trunk and head at a position."""
         parts = (
             (mujoco.mjtGeom.mjGEOM_CYLINDER, (0.8 * radius, 0.4, 0.0), 0.4, (0.2, 0.24, 0.36, 1.0)),
             (mujoco.mjtGeom.mjGEOM_CYLINDER, (radius, 0.32, 0.0), 1.12, (0.6, 0.24, 0.2, 1.0)),

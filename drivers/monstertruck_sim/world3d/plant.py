@@ -1,7 +1,7 @@
 """Rigid-body robot on MuJoCo's time grid of 2 ms; all engines share the motor, servo and battery models.
 
-A command takes effect in the next integrated step: a step is integrated only when an instant at or beyond its end is
-requested, so it includes every command up to then.
+A command takes effect in the next integrated step: a step is integrated only when a time at or beyond its end is
+requested, so that it includes every command up to that time.
 """
 
 from collections.abc import Callable, Sequence
@@ -66,16 +66,16 @@ def _tyres(model: mujoco.MjModel, parts: Mechanics, radius: float) -> _Tyres | N
 
 
 class RigidPlant(Plant):
-    """One robot of rigid bodies.
+    """One rigid-body robot.
 
     Args:
         config: true parameters.
         battery: battery model parameters.
-        start: pose of the geometric centre.
-        model: MuJoCo model of robot and surroundings.
-        drive: drive line of the robot.
+        start: initial pose of the geometric centre.
+        model: MuJoCo model of the robot and its surroundings.
+        drive: the robot's drive line.
         steering: converts servo angles to wheel angles.
-        ground: returns the height of the ground at a point of the map (m).
+        ground: returns the ground height at a point on the map (m).
         parts: masses and springs.
     """
 
@@ -121,17 +121,17 @@ class RigidPlant(Plant):
 
     @property
     def acceleration(self) -> Xyz:
-        """Acceleration of the body without gravity, as sensed on it: forward, left, up in its level frame (m/s^2)."""
+        """Acceleration without gravity, as sensed on the body: forward, left, up in its level frame (m/s^2)."""
         return self._felt
 
     @property
     def rates(self) -> Xyz:
-        """Angular velocity about forward, left and up of the level frame (rad/s)."""
+        """Angular velocity about the level frame's forward, left and up axes (rad/s)."""
         return self._turning
 
     @property
     def height(self) -> float:
-        """Height of the base above the plane of the map (m)."""
+        """Height of the base above the map plane (m)."""
         return self._height
 
     def mount_torque(self, joint: int, /) -> float:
@@ -147,7 +147,7 @@ class RigidPlant(Plant):
         """Move the robot to another pose, at rest; sensors see no motion between the two poses.
 
         Raises:
-            InputError: the robot cannot stand there, and stays in place.
+            InputError: the robot cannot stand at that pose; it remains in place.
         """
         before = self._pose
         try:
@@ -159,12 +159,12 @@ class RigidPlant(Plant):
         self._remember()
 
     def stand(self, pitch: float, roll: float) -> None:
-        """Put the robot onto blocks that tilt it (rad), or off them (0, 0); it comes to rest at the same position.
+        """Put the robot onto blocks that tilt it (rad), or take it off them (0, 0); its position stays the same.
 
-        Without a tilt, a robot that is not on blocks is unchanged.
+        Zero tilt leaves a robot that is not on blocks unchanged.
 
         Raises:
-            InputError: the robot cannot stand at this tilt; it is unchanged.
+            InputError: the robot cannot stand at this tilt and is left unchanged.
         """
         if not any((pitch, roll, *self._on_blocks)):
             return
@@ -282,11 +282,11 @@ class RigidPlant(Plant):
             raise CommandFailedError(f"the simulation of the robot at ({x:.2f}, {y:.2f}) became unstable")
 
     def _roll(self, places: list[float], speeds: list[float]) -> None:
-        """Update the deflection of the tyres at the contact; rolling replaces the deflected part of the tyre.
+        """Update the tyre deflections at the contact; rolling replaces the deflected part of the tyre.
 
-        Their deflection d follows d' = u' - |v| d / relaxation, u' being the slip of the rolling wheel: the force
-        settles at ``tyre_stiffness`` times the slip ratio, or the tangent of the slip angle, and dry friction bounds
-        it (a relaxation length; e.g. Pacejka, Tyre and Vehicle Dynamics, chapter 7).
+        The deflection d follows d' = u' - |v| d / relaxation, where u' is the slip velocity of the rolling wheel: the
+        force settles at ``tyre_stiffness`` times the slip ratio or the tangent of the slip angle, and is bounded by dry
+        friction (a relaxation length; e.g. Pacejka, Tyre and Vehicle Dynamics, chapter 7).
         """
         data, tyres = self.data, self._tyres
         if self._rolling:
@@ -316,7 +316,7 @@ class RigidPlant(Plant):
             controls[self._first_shaft + i] = self._wound[i] + drive.damping / drive.stiffness * speed
 
     def _slip(self) -> list[float]:
-        """Return the force of every shaft at the ground (N); a slipping clutch stops further wind-up of the wheels."""
+        """Return every shaft's force at the ground (N); a slipping clutch prevents further wheel wind-up."""
         drive, data, pulls = self._drive, self.data, []
         for i, shaft in enumerate(self.shafts):
             index = self._first_shaft + i
@@ -330,7 +330,7 @@ class RigidPlant(Plant):
         return pulls
 
     def _read(self, places: list[float], speeds: list[float]) -> None:
-        """Read pose, twist and rates of the base, which come first in the state."""
+        """Read the base's pose, twist and rates, which come first in the state."""
         x, y, z, qw, qx, qy, qz = places[:7]
         forward_x, forward_y = 1.0 - 2.0 * (qy * qy + qz * qz), 2.0 * (qx * qy + qw * qz)
         down = 2.0 * (qx * qz - qw * qy)
@@ -350,7 +350,7 @@ class RigidPlant(Plant):
         self._velocity = vx, vy, vz
 
     def _feel(self, before: Xyz) -> None:
-        """Compute the acceleration of a step, from the velocity before it, through the sensor's filter."""
+        """Compute the acceleration of a step from the velocity before it, and pass it through the sensor's filter."""
         ax, ay, az = ((now - then) / TIMESTEP for now, then in zip(self._velocity, before, strict=True))
         c, s = cos(self._pose[2]), sin(self._pose[2])
         # 0.05: time constant of an accelerometer's mount and filter, s
