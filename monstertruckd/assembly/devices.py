@@ -193,7 +193,7 @@ def _written(role: str, device: Device[Any], config: TruckConfig) -> list[Topic[
 
 
 def measures_battery(config: TruckConfig) -> bool:
-    """Whether anything is configured to measure the battery."""
+    """Return whether anything is configured to measure the battery."""
     return config.monitors.battery is not None or any(packs(config.devices, config.monitors))
 
 

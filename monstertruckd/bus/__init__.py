@@ -1,1 +1,1 @@
-"""Message bus: hand-over inside the process, and its bridge to Zenoh."""
+"""Message bus: message passing inside the process, and its bridge to Zenoh."""

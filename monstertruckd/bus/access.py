@@ -1,11 +1,11 @@
 """Access rules: the permissions of each certificate over Zenoh.
 
-Zenoh's access rules bind a name to a certificate: under ``req/<name>/...`` and ``rpc/.../<name>`` only that
-certificate's requests arrive. The daemon looks up the grant of the name. So it answers a source that requests too much,
-and drops a request under another name.
+Zenoh's access rules bind a name to a certificate: under ``req/<name>/...`` and ``rpc/.../<name>``, only requests with
+that certificate arrive. The daemon looks up the grant for the name, so it can answer a source that requests more than
+it may, and it drops a request under another name.
 
-Groups out of the robot may only leave it and requests may only enter it, so that no other peer can forge the robot's
-state to the others. A rule covers a declaration only if it contains the whole declared key expression.
+State groups may only leave the robot and requests may only enter it, so that no peer can forge the robot's state
+towards other peers. A rule covers a declaration only if it contains the complete declared key expression.
 """
 
 from collections.abc import Iterable, Mapping
@@ -31,14 +31,14 @@ _DESCRIPTIONS: Final = ("topics", "schema/**")
 
 @dataclass(frozen=True, slots=True)
 class Grant:
-    """Grant of one source."""
+    """Permissions of one source."""
 
     role: AccessRole
     rank: Role
     """Highest priority it may claim."""
 
     def capped(self, role: Role) -> Role:
-        """``role``, or the rank if that is lower; only the receiver has the role of the hand."""
+        """Return ``role``, or the grant's rank if that is lower; only the receiver has the role of the hand."""
         order = list(Role)
         return max(Role.GAMEPAD if role is Role.HAND else role, self.rank, key=order.index)
 
@@ -49,23 +49,23 @@ OBSERVING: Final = Grant(AccessRole.OBSERVER, Role.STATION)
 
 @dataclass(frozen=True, slots=True)
 class Sender:
-    """Sender of a request or a call, by its key."""
+    """Sender of a request or a call, identified by its key."""
 
     source: str
     grant: Grant
 
     def may(self, needed: AccessRole) -> bool:
-        """Whether its role covers ``needed``."""
+        """Return whether the sender's role covers ``needed``."""
         return self.grant.role.covers(needed)
 
     def refusal(self, needed: AccessRole) -> str:
-        """Reason why the role of this source does not include ``needed``."""
+        """Reason why the role of this sender does not include ``needed``."""
         hint = "; the key contains no source" if self.source == ANONYMOUS else ""
         return f"{self.source} has the role {self.grant.role}, but this needs {needed}{hint}"
 
 
 def role_needed(request: Request) -> AccessRole:
-    """Role that a request requires: any for the emergency stop, engineer for shaft speeds."""
+    """Return the role that a request requires: any role for the emergency stop, engineer for shaft speeds."""
     if isinstance(request, DriveRequest) and request.form is DriveForm.SHAFTS:
         return AccessRole.ENGINEER
     estop = isinstance(request, ControlRequest) and request.order is Order.ESTOP
@@ -73,7 +73,7 @@ def role_needed(request: Request) -> AccessRole:
 
 
 def out_groups() -> tuple[str, ...]:
-    """Groups that only leave the robot, in the table's order."""
+    """Groups that only leave the robot, in the order of the table."""
     return tuple(dict.fromkeys(topic.group for topic in TOPICS if not topic.inward))
 
 
@@ -83,16 +83,16 @@ def in_groups() -> tuple[str, ...]:
 
 
 def access_rules(robot: str, owners: Iterable[str] | None = None, routers: Iterable[str] = ()) -> dict[str, Any]:
-    """Zenoh ``access_control`` section for ``robot``.
+    """Return the Zenoh ``access_control`` section for ``robot``.
 
-    The rules know no variables: each certificate has its own rules, subject and policy.
+    Zenoh's rules have no variables: each certificate has its own rules, subject and policy.
 
     Args:
         robot: name of the robot.
-        owners: common names of the certificates that may see, and request under their own name; None if every client
-            may, under any name.
-        routers: common names of a fleet's routers. Their messages may carry the name of any owner: the router
-            has compared it with the certificate (``router_rules``).
+        owners: common names of the certificates that may see the robot and send requests under their own name; None if
+            every client may, under any name.
+        routers: common names of a fleet's routers. Their messages may carry the name of any owner, because the router
+            has compared the name with the certificate (``router_rules``).
     """
     common = _common(robot)
     if owners is None:
@@ -116,10 +116,10 @@ def access_rules(robot: str, owners: Iterable[str] | None = None, routers: Itera
 
 
 def router_rules(fleet: Mapping[str, Iterable[str]]) -> dict[str, Any]:
-    """Zenoh ``access_control`` section of a router between robots and stations.
+    """Return the Zenoh ``access_control`` section for a router between robots and stations.
 
-    A robot publishes its own state only, and receives requests to itself only. A station observes and calls the robots
-    that know it, under its own name; it may watch for all robots, and finds those.
+    A robot publishes only its own state and receives only requests addressed to it. A station observes and calls, under
+    its own name, the robots that know it; it may watch for all robots, and finds these.
 
     Args:
         fleet: common names of the stations that each robot knows, by the robot's name, which is the common name of its
@@ -181,12 +181,12 @@ def _common(robot: str) -> list[dict[str, Any]]:
 
 
 def _all_keys(robot: str) -> tuple[list[str], list[str]]:
-    """Keys of all requests and of all calls."""
+    """Keys of all requests, and of all calls."""
     return [f"{KEY_ROOT}/{robot}/{group}/**" for group in in_groups()], [rpc_key(robot, "**")]
 
 
 def _fleet_rule() -> dict[str, Any]:
-    """Robots are looked for by one expression for all, which no rule of a single robot contains."""
+    """Rule for the discovery of robots: one expression covers all robots, so no rule for a single robot contains it."""
     return _rule(FLEET_RULE, "ingress", ["declare_liveliness_subscriber", "liveliness_query"], [alive_key("*")])
 
 
@@ -199,7 +199,7 @@ def _subject(name: str) -> dict[str, Any]:
 
 
 def _keys_of(robot: str, owner: str) -> tuple[list[str], list[str]]:
-    """Keys of the requests and of the calls of an owner's programs."""
+    """Keys of the requests and calls from an owner's programs."""
     sources = (owner, f"{owner}:$*")
     requests = [f"{KEY_ROOT}/{robot}/{group}/{source}/**" for group in in_groups() for source in sources]
     return requests, [rpc_key(robot, "*", source) for source in sources]

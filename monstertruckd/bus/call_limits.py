@@ -1,6 +1,7 @@
-"""Limits of remote calls, checked in the receiving thread, so that a flood does not reach the event loop.
+"""Limits on remote calls, checked in the receiving thread so that a flood does not reach the event loop.
 
-An emergency stop is refused only where as many of the same owner, or of all together, are being carried out.
+An emergency stop is refused only if too many stops from the same owner, or from all owners together, are already in
+progress.
 """
 
 import threading
@@ -19,7 +20,7 @@ ORDERS: Final = frozenset(order.value for order in Order)
 
 
 class Allowance(NamedTuple):
-    """Limits of the calls of one kind."""
+    """Limits on calls of one kind."""
 
     rate: float
     """Maximum calls per second of one owner."""
@@ -34,7 +35,7 @@ ORDER_CALLS: Final = Allowance(ORDER_RATE, 2 * CALLS.served, 2 * CALLS.waiting)
 
 
 class EstopLimit(NamedTuple):
-    """Emergency stops that wait or are carried out."""
+    """Limits on emergency stops that are waiting or being carried out."""
 
     owner: int
     together: int
@@ -46,10 +47,10 @@ TOO_MANY: Final = "too many calls at once"
 
 
 class CallLimits:
-    """Counts calls; callable from any thread.
+    """Counts calls; may be called from any thread.
 
     Args:
-        clock: time.
+        clock: time source.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -59,12 +60,12 @@ class CallLimits:
         self._estops: Counter[str] = Counter()
 
     def refusal(self, name: str, source: str | None, waiting: int) -> str:
-        """Return the reason for refusing a call; empty to accept it. Each accepted emergency stop must be ``ended``.
+        """Return the reason for refusing a call; empty to accept it. Call ``ended`` for each accepted emergency stop.
 
         Args:
             name: name of the call.
             source: caller; None if the key names no source.
-            waiting: calls that wait to be served.
+            waiting: number of calls waiting to be served.
         """
         source = source or ANONYMOUS
         if name == ESTOP:
@@ -83,7 +84,7 @@ class CallLimits:
         return TOO_MANY if waiting >= allowance.waiting else ""
 
     def ended(self, name: str, source: str | None) -> None:
-        """Note that an accepted call was carried out or discarded."""
+        """Record that an accepted call was carried out or discarded."""
         if name == ESTOP:
             with self._lock:
                 owner = owner_of(source or ANONYMOUS)
@@ -93,7 +94,7 @@ class CallLimits:
 
 
 def may_be_served(name: str, under_way: int) -> bool:
-    """Whether a call has a place while ``under_way`` others, emergency stops not counted, are served."""
+    """Return whether a call may be served while ``under_way`` others, except emergency stops, are served."""
     return name == ESTOP or under_way < _allowance(name).served
 
 

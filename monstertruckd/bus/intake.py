@@ -1,8 +1,8 @@
 """Intake of requests: checked in Zenoh's thread, then passed to the event loop one at a time.
 
-Even in another thread a decoder holds the interpreter while it runs, so input is bounded by size, by rate and by a look
-at the bytes before it is decoded. Every topic has its own queue, and every owner its own rate: a flood of one delays no
-other. Orders that stop are never refused; those that repeat faster than the truck could notice are taken together.
+Even in another thread, a decoder holds the interpreter while it runs, so the size, the rate and the first look of the
+input are checked before decoding. Every topic has its own queue, and every owner its own rate, so a flood from one does
+not delay the others. Stop orders are never refused; if they repeat faster than the truck could react, they are merged.
 """
 
 import asyncio
@@ -47,7 +47,7 @@ TOGETHER: Final = 5.0
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """Limits of one topic."""
+    """Limits on one topic."""
 
     size: int = 2048
     """Bytes of one request."""
@@ -71,14 +71,14 @@ ORDER_RATE: Final = 5.0
 
 @dataclass(slots=True)
 class _Budget:
-    """Requests that may come at once; as many as come in a second at the greatest rate."""
+    """Number of requests that may be accepted now; at most the number allowed per second."""
 
     left: float
     at: int
     """When it was true (ns)."""
 
     def spend(self, now: int, rate: float) -> bool:
-        """Take one; False if there is none."""
+        """Use one request from the budget; return False if none is left."""
         self.left = min(self.left + (now - self.at) / SECOND * rate, rate)
         self.at = now
         if self.left < 1.0:
@@ -88,11 +88,11 @@ class _Budget:
 
 
 class OwnerRates:
-    """Limits the request rates of each owner's programs, and of all together; callable from any thread.
+    """Limits the request rate of each owner's programs, and of all owners together; may be called from any thread.
 
     Args:
-        rate: requests a second of one owner, in bursts of as many.
-        clock: time.
+        rate: requests per second for one owner; also the maximum burst.
+        clock: time source.
     """
 
     def __init__(self, rate: float, clock: Clock) -> None:
@@ -103,7 +103,7 @@ class OwnerRates:
         self._together = _Budget(rate * TOGETHER, clock.now())
 
     def spend(self, source: str) -> bool:
-        """Count one request of ``source``; False if its owner has sent too many."""
+        """Count one request from ``source``; return False if its owner has sent too many."""
         owner = owner_of(source)
         with self._lock:
             now = self._clock.now()
@@ -116,14 +116,14 @@ class OwnerRates:
 
 
 class Refusals:
-    """Report refused requests as events, at most once a second, so that a flood of garbage causes no flood of events.
+    """Reports refused requests as events, at most once per second, so that garbage cannot cause a flood of events.
 
-    Construct it on the event loop.
+    Must be constructed on the event loop.
 
     Args:
-        bus: where the events go.
-        clock: time.
-        reporter: who reports.
+        bus: bus that carries the events.
+        clock: time source.
+        reporter: name of the reporting service.
     """
 
     def __init__(self, bus: Bus, clock: Clock, reporter: str) -> None:
@@ -136,7 +136,7 @@ class Refusals:
         self._reports: ThreadHop[tuple[Reason, str, str, int]] = ThreadHop(self._report, 1, lambda _: None)
 
     def add(self, reason: Reason, source: str, text: str) -> None:
-        """One request of ``source`` was refused; callable from any thread."""
+        """Record that a request from ``source`` was refused; may be called from any thread."""
         with self._lock:
             now = self._clock.now()
             self._count += 1
@@ -146,7 +146,7 @@ class Refusals:
         self._reports.put((reason, source, text, count))
 
     def close(self) -> None:
-        """Report nothing more."""
+        """Stop reporting."""
         self._reports.close()
 
     def _report(self, refusal: tuple[Reason, str, str, int]) -> None:
@@ -155,12 +155,12 @@ class Refusals:
 
 
 class Repeats:
-    """Hold the latest order of each owner for a moment, so that the event loop receives few.
+    """Holds the latest order from each owner briefly, to limit the number of orders passed to the event loop.
 
-    Construct it on the event loop.
+    Must be constructed on the event loop.
 
     Args:
-        deliver: called on the loop with each.
+        deliver: called on the loop with each order.
     """
 
     def __init__(self, deliver: Callable[[Message], None]) -> None:
@@ -170,11 +170,11 @@ class Repeats:
         self._newest: dict[str, Callable[[], Message]] = {}
 
     def put(self, source: str, order: Callable[[], Message]) -> None:
-        """Deliver an order in ``REPEAT`` seconds, unless its owner gives a newer one; callable from any thread.
+        """Deliver an order after ``REPEAT`` seconds unless its owner gives a newer one; may be called from any thread.
 
         Args:
-            source: who gives it.
-            order: makes it, on the loop.
+            source: source of the order.
+            order: creates the order, on the loop.
         """
         owner = owner_of(source)
         with self._lock:
@@ -197,15 +197,15 @@ class Repeats:
 
 
 class Intake:
-    """Takes in the requests of one topic; to be made on the loop.
+    """Accepts the requests of one topic; must be constructed on the loop.
 
     Args:
-        topic: a topic that outsiders write.
-        bus: where the requests go.
-        clock: time.
+        topic: topic that clients outside the daemon may write.
+        bus: bus that carries the requests.
+        clock: time source.
         guard: runs callbacks on the event loop, so that their errors are reported.
-        reporter: who reports refusals.
-        only: the accepted order, on a separate path; None for all.
+        reporter: name of the service that reports refusals.
+        only: the only order accepted, on a separate path; None for all orders.
     """
 
     def __init__(
@@ -238,12 +238,12 @@ class Intake:
         self._repeats = {Order.ESTOP: Repeats(self._estops.put), Order.STOP: Repeats(self._requests.put)}
 
     def take(self, sender: Sender, size: int, read: Callable[[], bytes]) -> None:
-        """Judge, decode and queue one request; callable from any thread.
+        """Check, decode and queue one request; may be called from any thread.
 
         Args:
-            sender: owner by the key, whatever the request claims.
-            size: bytes it has.
-            read: gets them.
+            sender: owner according to the key, whatever the request claims.
+            size: size of the request (bytes).
+            read: returns the bytes of the request.
         """
         name, limit, source = self._name, self._limit, sender.source
         if size > limit.size:
@@ -285,7 +285,7 @@ class Intake:
             (self._estops if order is Order.ESTOP else self._requests).put(request.model_copy(update=said))
 
     def _may_order(self, sender: Sender) -> bool:
-        """Whether an order that does not stop is taken; it is counted, and reported if not."""
+        """Return whether an order that does not stop the truck is accepted; count it, and report a refusal."""
         name, needed = self._name, AccessRole.PILOT
         if not sender.may(needed):
             self._refusals.add(Reason.NOT_PERMITTED, sender.source, f"{name}: {sender.refusal(needed)}")
@@ -297,23 +297,23 @@ class Intake:
         return False
 
     def charge(self, source: str) -> bool:
-        """Count one request of ``source``; False if its owner has sent too many. Callable from any thread."""
+        """Count one request from ``source``; False if its owner has sent too many. May be called from any thread."""
         return self._rates is None or self._rates.spend(source)
 
     def close(self) -> None:
-        """Discard waiting and later messages."""
+        """Discard waiting messages and all later ones."""
         self._requests.close()
         self._estops.close()
         self._refusals.close()
 
 
 class StandIntake:
-    """Receives a test stand's observations of the robot, for the recorder; to be made on the loop.
+    """Receives a test stand's observations of the robot for the recorder; must be constructed on the loop.
 
     Args:
-        bus: bus whose taps get it.
-        clock: time.
-        guard: as of ``Intake``.
+        bus: bus whose taps get the observations.
+        clock: time source.
+        guard: see ``Intake``.
         refusals: reports refused messages.
     """
 
@@ -332,7 +332,7 @@ class StandIntake:
         )
 
     def take(self, size: int, read: Callable[[], bytes]) -> None:
-        """Judge, decode and queue one pose; callable from any thread. Arguments as of ``Intake.take``."""
+        """Check, decode and queue one pose; may be called from any thread. For the arguments see ``Intake.take``."""
         name = STAND_POSE.name
         if size > self.SIZE:
             self._refusals.add(Reason.BAD_INPUT, name, f"{name}: {size} bytes, at most {self.SIZE} are accepted")
@@ -345,12 +345,15 @@ class StandIntake:
                 self._refusals.add(Reason.BAD_INPUT, name, str(error))
 
     def close(self) -> None:
-        """Discard waiting and later messages."""
+        """Discard waiting messages and all later ones."""
         self._poses.close()
 
 
 def _may_stop(data: bytes) -> bool:
-    """Whether an order may be one that stops: cheaper than decoding it. An escaped letter is written by a backslash."""
+    """Return whether an order may be a stop order, without the cost of decoding it.
+
+    Escaped letters are covered because they start with a backslash.
+    """
     return b"stop" in data or b"\\" in data
 
 

@@ -1,8 +1,8 @@
-"""In-process hand-over: one write end per topic, any number of read ends, messages passed by reference.
+"""Message passing in the process: one publisher per topic, any number of subscribers, messages passed by reference.
 
-Everything happens on the event loop. A message reaches listeners at once, then its readers in the order of
-subscription; then, at once or a moment later, the taps (recorder, Zenoh) get it with its wire bytes, encoded once for
-all of them.
+Everything happens on the event loop. A message reaches listeners immediately, then its readers in the order of
+subscription. The taps (recorder, Zenoh) get the message immediately or a moment later, with its wire bytes, encoded
+once for all taps.
 """
 
 import math
@@ -31,7 +31,7 @@ Must not block, nor raise."""
 
 
 class LocalPublisher(Generic[M]):
-    """Write end of one topic, made by ``Bus``."""
+    """Write end of one topic, created by ``Bus``."""
 
     def __init__(self, bus: "Bus", topic: Topic[M]) -> None:
         self._bus = bus
@@ -45,7 +45,7 @@ class LocalPublisher(Generic[M]):
         return seq
 
     def put(self, message: M) -> None:
-        """Hand ``message`` to every reader and tap; never blocks."""
+        """Pass ``message`` to every reader and tap; never blocks."""
         self._bus.hand_over(self._topic, message)
 
 
@@ -75,12 +75,12 @@ class _ReadEnds:
 class Bus:
     """Topics of one daemon.
 
-    Write ends are handed out once each and only to the writer the topic table names, so that writing rights are settled
-    at assembly.
+    Each write end is handed out once, and only to the writer named in the topic table, so that write access is settled
+    when the daemon is assembled.
 
     Args:
-        clock: time.
-        gather_seconds: messages of regular topics reach the taps together, about this late at most; 0: at once.
+        clock: time source.
+        gather_seconds: maximum delay of regular topics' messages, which reach the taps in batches; 0 for no delay.
     """
 
     def __init__(self, clock: Clock, gather_seconds: float = 0.0) -> None:
@@ -96,7 +96,7 @@ class Bus:
         self._events = LocalPublisher(self, EVENT)
 
     def publisher(self, topic: Topic[M], writer: Writer) -> Publisher[M]:
-        """The one write end of ``topic``.
+        """Return the only write end of ``topic``.
 
         Raises:
             RuntimeError: ``writer`` is not the topic's writer, the write end is taken, or the topic has none
@@ -111,19 +111,19 @@ class Bus:
         return self._claim(topic)
 
     def actuators(self, shafts: int = 1) -> tuple[tuple[Publisher[DriveCommand], ...], Publisher[SteeringCommand]]:
-        """Write ends of the actuators, for the safety gate alone: of so many driven shafts, and of the steering.
+        """Return the write ends of the actuators, for the safety gate only: ``shafts`` drives and the steering.
 
         Raises:
-            RuntimeError: they were handed out before.
+            RuntimeError: the write ends have already been handed out.
         """
         return tuple(self._claim(topic) for topic in CMD_DRIVES[:shafts]), self._claim(CMD_STEERING)
 
     def event_sink(self) -> EventSink:
-        """Sink of every service's events; all share one topic and its sequence numbers."""
+        """Return the sink for every service's events; they share one topic and its sequence numbers."""
         return self._emit
 
     def subscribe(self, topic: Topic[M], delivery: Delivery) -> Mailbox[M]:
-        """Return a read end of ``topic``; for a retained topic it holds the latest message at once.
+        """Return a read end of ``topic``; for a retained topic it holds the latest message immediately.
 
         Raises:
             RuntimeError: the topic is written by a test stand and must not be read in the robot.
@@ -136,16 +136,16 @@ class Bus:
         return mailbox
 
     def listen(self, topic: Topic[M], listener: Callable[[M], object]) -> None:
-        """Call ``listener``, which must not block, with every message of ``topic``: no queue, so none is ever lost.
+        """Call ``listener``, which must not block, with every message of ``topic``; no queue, so none is lost.
 
         Raises:
-            RuntimeError: as ``subscribe`` does.
+            RuntimeError: see ``subscribe``.
         """
         _require_own(topic)
         self._ends[topic.name].listeners.append(listener)
 
     def newest(self, topic: Topic[M]) -> M | None:
-        """Latest message of a retained topic; None before the first, and for every other topic."""
+        """Latest message of a retained topic; None before the first message and for all other topics."""
         held = self._retained.get(topic.name)
         return None if held is None else held[1]
 
@@ -155,7 +155,7 @@ class Bus:
             yield topic, message, wire.encode(topic, message)
 
     def tap(self, callback: TapCallback, topics: Iterable[Topic[Any]]) -> Tap:
-        """Call ``listener`` with every message of ``topics``, first with the retained ones.
+        """Call ``callback`` with every message of ``topics``, starting with the retained ones.
 
         All taps of a topic share one encoding; a topic without taps is never encoded.
         """
@@ -171,12 +171,12 @@ class Bus:
         return tap
 
     def inject(self, topic: Topic[M], message: M) -> list[object]:
-        """Take in a request from outside; ``received`` becomes the daemon's own time, whatever it claimed.
+        """Accept a request from outside; ``received`` is set to the daemon's own time, whatever the request claimed.
 
-        Returns the listeners' results, in their order.
+        Returns the listeners' results in their order.
 
         Raises:
-            RuntimeError: outsiders may not write ``topic``.
+            RuntimeError: clients may not write ``topic``.
         """
         if topic.writer is not Writer.OUTSIDE:
             msg = f"{topic.name} is written by {topic.writer}, not from outside"
@@ -184,10 +184,10 @@ class Bus:
         return self.hand_over(topic, message.model_copy(update={"received": self._clock.now()}))
 
     def put_stand(self, topic: Topic[M], message: M) -> None:
-        """Deliver a test stand's message to the taps alone. ``received`` becomes the daemon's own time.
+        """Deliver a test stand's message only to the taps; ``received`` is set to the daemon's own time.
 
         Raises:
-            RuntimeError: stands may not write ``topic``.
+            RuntimeError: test stands may not write ``topic``.
         """
         if topic.writer is not Writer.STAND:
             msg = f"{topic.name} is written by {topic.writer}, not by a stand"
@@ -227,10 +227,10 @@ class Bus:
             tap.topics = frozenset()
 
     def _deliver_to_taps(self, batch: Sequence[Sent]) -> None:
-        """Encode the whole batch, then hand it to one tap after the other.
+        """Encode the complete batch, then pass it to one tap after another.
 
         Raises:
-            Exception: a message cannot be encoded, or a tap has a bug; that costs nothing but this message.
+            Exception: a message cannot be encoded, or a tap has a bug; only this message is lost.
         """
         encoded: list[tuple[Topic[Any], Message, bytes, int]] = []
         bug: Exception | None = None
@@ -284,5 +284,5 @@ def _require_own(topic: Topic[Any]) -> None:
 
 
 def _plain(value: Value) -> Value:
-    """A value the wire can carry: non-finite numbers as their name."""
+    """Return a value that the wire format can carry: a non-finite number is replaced by its name."""
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,6 +1,6 @@
-"""Outgoing messages in batches: a message that follows another costs a fraction of a single one.
+"""Outgoing messages in batches: a message that follows another costs a fraction of a single message.
 
-The code that encodes, records and puts is then in the caches, and each batch wakes Zenoh's threads once.
+The code that encodes, records and sends messages is then in the caches, and each batch wakes Zenoh's threads once.
 """
 
 import asyncio
@@ -21,11 +21,11 @@ Sent = tuple[Topic[Any], Message, int]
 
 
 class Outgoing:
-    """Delivers messages of no rate at once, and with them, or after a moment, the regular ones that wait before them.
+    """Delivers messages without a fixed rate immediately, and regular messages with them or after a short delay.
 
     Args:
-        seconds: batches leave a moment after the multiples of this; 0: nothing waits.
-        deliver: gets a batch of messages.
+        seconds: batches are sent shortly after multiples of this period; 0 for no delay.
+        deliver: receives a batch of messages.
     """
 
     def __init__(self, seconds: float, deliver: Callable[[Sequence[Sent]], None]) -> None:
@@ -36,7 +36,7 @@ class Outgoing:
         self._timer: asyncio.Handle | None = None
 
     def send(self, topic: Topic[Any], message: Message, at: int) -> None:
-        """Deliver now or soon; messages never overtake each other."""
+        """Deliver a message now or soon; messages never overtake each other."""
         self._waiting.append((topic, message, at))
         # 1.0: topics of so many messages a second or more may wait for others
         if not self._period or topic.rate is None or topic.rate < 1.0:
@@ -59,7 +59,7 @@ class Outgoing:
                 self._timer = asyncio.get_running_loop().call_soon(self._due)
 
     def _due(self) -> None:
-        """Deliver all that waits, one batch per iteration of the event loop."""
+        """Deliver all waiting messages, one batch per iteration of the event loop."""
         try:
             if self._waiting:
                 self._next_batch()

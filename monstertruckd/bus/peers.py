@@ -20,8 +20,8 @@ class PeerService:
     """Publishes the latest poses of other robots at a steady rate, with the time of receipt.
 
     Args:
-        clock: time.
-        out: ``state/peers``.
+        clock: time source.
+        out: publisher for ``state/peers``.
     """
 
     name = ServiceName.PEERS.value
@@ -31,7 +31,7 @@ class PeerService:
         self._heard: dict[str, Peer] = {}
 
     def hear(self, robot: str, pose: Odometry) -> None:
-        """Take the latest pose of another robot."""
+        """Process the latest pose of another robot."""
         self._heard[robot] = Peer(
             robot=robot,
             pose=pose.pose,
@@ -55,13 +55,13 @@ class PeerService:
 
 
 class PeerSubscriber:
-    """Receives the poses of one other robot; ready with the first one.
+    """Receives the poses of one other robot; ready when the first pose arrives.
 
     Args:
-        robot: its name.
-        config: where it is.
-        clock: time.
-        peers: gets its poses.
+        robot: name of the robot.
+        config: address of the robot.
+        clock: time source.
+        peers: service that receives its poses.
     """
 
     def __init__(self, robot: str, config: PeerConfig, clock: Clock, peers: PeerService) -> None:
@@ -72,8 +72,8 @@ class PeerSubscriber:
         """Listen until cancelled.
 
         Raises:
-            NotFoundError: no robot answers there, or none of this name.
-            NoAnswerError: it has published no pose for 5 s.
+            NotFoundError: no robot answers at the address, or none with this name.
+            NoAnswerError: the robot has published no pose for 5 s.
         """
         endpoint = self._config.endpoint
         async with TruckClient(self._robot, endpoint, clock=self._clock) as client:

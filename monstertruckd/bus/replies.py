@@ -1,11 +1,11 @@
 """Answers to stations, sent by separate threads.
 
-A reply, and the final message of a query that is dropped, waits for room towards its station: 2 s towards one that
-takes nothing. Neither the event loop nor the receiving threads may block for so long.
+A reply, and the final message of a query that is dropped, waits for room in the queue to its station: 2 s if the
+station reads nothing. Neither the event loop nor the receiving threads may block for that long.
 
-Zenoh serves no station while it hangs up on one, and that takes 2 s more for each further thread that is still waiting
-for room there: with eight of them, 14 s. So one owner has one reply under way. Queries without a source share one:
-Zenoh does not report the session of a query, and a client's own claims prove nothing.
+While Zenoh closes the connection to a station, it serves no other station, and this takes 2 s more for each further
+thread that still waits for room: 14 s with eight threads. So each owner may have only one reply in progress. Queries
+without a source share one: Zenoh does not report the session of a query, and a client's own claims prove nothing.
 """
 
 import logging
@@ -31,7 +31,7 @@ Reply = Callable[[zenoh.Query], object]
 
 
 class Replies:
-    """Ends queries: sends their replies, and their final messages."""
+    """Ends queries: sends their replies and their final messages."""
 
     def __init__(self) -> None:
         self._orders = ThreadPoolExecutor(THREADS, "order-replies")
@@ -42,20 +42,20 @@ class Replies:
         """Waiting replies by owner, orders separate; the first of each is under way."""
 
     def wait_for_room(self) -> None:
-        """Wait until there is room for one more reply; not for the event loop."""
+        """Wait until there is room for another reply; must not be called on the event loop."""
         with self._change:
             self._change.wait_for(lambda: self._waiting < self._most)
 
     def end(
         self, query: zenoh.Query, reply: Reply | None = None, source: str | None = None, *, order: bool = False
     ) -> None:
-        """Reply and end the query, without waiting for it; callable from any thread.
+        """Reply to the query and end it, without waiting; may be called from any thread.
 
         Args:
-            query: not to be used any more.
-            reply: None to end it without an answer.
+            query: query to end; must not be used afterwards.
+            reply: the reply; None to end the query without an answer.
             source: caller; None if the query names no source.
-            order: whether it answers an order: these do not wait behind the others.
+            order: whether the query is an order: replies to orders do not wait behind the others.
         """
         key = owner_of(source or ANONYMOUS), order
         with self._change:
@@ -68,7 +68,7 @@ class Replies:
             (self._orders if order else self._others).submit(self._end_all, key)
 
     def close(self) -> None:
-        """Wait for all replies: with the sessions closed they fail at once."""
+        """Wait for all replies; once the sessions are closed, they fail immediately."""
         for pool in (self._orders, self._others):
             pool.shutdown()
 

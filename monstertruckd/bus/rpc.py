@@ -26,9 +26,9 @@ class Rpc:
     """Registry of handlers.
 
     Args:
-        clock: time of the deadlines.
-        deadline: seconds a handler may take.
-        record: gets name, source, payload, reason and answer of every call from outside that is recorded.
+        clock: clock for the deadlines.
+        deadline: maximum duration of a handler (s).
+        record: receives name, source, payload, reason and answer of every recorded call from outside.
     """
 
     def __init__(
@@ -44,9 +44,9 @@ class Rpc:
     def register(
         self, name: str, handler: Handler, role: AccessRole = AccessRole.PILOT, *, recorded: bool = True
     ) -> None:
-        """Serve ``name`` by ``handler`` for callers that have ``role``, or one that may do more.
+        """Serve ``name`` with ``handler`` for callers that have ``role`` or a higher one.
 
-        Calls that only read, or come many times a second, are not ``recorded``.
+        Calls that only read, or that are made many times per second, are not ``recorded``.
 
         Raises:
             RuntimeError: the name is taken.
@@ -60,16 +60,16 @@ class Rpc:
             self._unrecorded.add(name)
 
     def serves(self, name: str) -> bool:
-        """Whether a handler is registered."""
+        """Return whether a handler is registered."""
         return name in self._handlers
 
     async def call(self, name: str, payload: dict[str, Any]) -> dict[str, Any]:
-        """Run one handler, for any caller.
+        """Run one handler for any caller.
 
         Raises:
             NotFoundError: the name does not exist; the text lists the existing names.
             NoAnswerError: the handler missed its deadline and was cancelled.
-            TruckError: whatever the handler refused with.
+            TruckError: the handler refused the call.
         """
         handler = self._handlers.get(name)
         if handler is None:
@@ -85,12 +85,12 @@ class Rpc:
             raise NoAnswerError(msg) from None
 
     async def answer(self, sender: Sender, name: str, payload: bytes) -> tuple[bool, bytes]:
-        """Serve one call from outside: JSON in, (success, JSON) out; never raises, a handler's bug is logged.
+        """Serve one call from outside: JSON in, (success, JSON) out; never raises, and logs a handler's bug.
 
         A failure is ``{"reason": ..., "text": ...}``.
 
         Args:
-            sender: who calls, by the key.
+            sender: caller, identified by the key.
             name: name of the call.
             payload: JSON object.
         """
@@ -100,7 +100,7 @@ class Rpc:
         return reason is Reason.OK, answered
 
     async def _answer(self, sender: Sender, name: str, payload: bytes) -> tuple[Reason, bytes]:
-        """Return ``OK`` and the answer, or the reason of the failure and the error reply."""
+        """Return ``OK`` and the answer, or the reason for the failure and the error reply."""
         needed = self._needed.get(name, AccessRole.OBSERVER)
         if not sender.may(needed):
             return Reason.NOT_PERMITTED, failure(Reason.NOT_PERMITTED, f"{name}: {sender.refusal(needed)}")
@@ -116,7 +116,7 @@ class Rpc:
 
 
 def topic_rows(robot: str) -> list[dict[str, Any]]:
-    """The topic table as JSON, for tools that know nothing of this program."""
+    """Return the topic table as JSON, for tools that do not use this package."""
     return [
         {
             "name": topic.name,
@@ -137,7 +137,7 @@ def topic_rows(robot: str) -> list[dict[str, Any]]:
 
 
 def _of_sender(sender: Sender, payload: dict[str, Any]) -> dict[str, Any]:
-    """The payload with the source and the role that its sender has; a role that is none is left to the handler."""
+    """Return the payload with the sender's source and role; an invalid role is left to the handler."""
     said = {**payload, "source": sender.source}
     with suppress(KeyError, ValueError):
         said["role"] = sender.grant.capped(Role(payload["role"])).value

@@ -1,4 +1,4 @@
-"""Endpoints and access of the robot over Zenoh."""
+"""Endpoints of the robot on Zenoh, and access to them."""
 
 import ipaddress
 import json
@@ -104,7 +104,7 @@ class ZenohConfig(Schema):
 
     @property
     def open_endpoints(self) -> tuple[str, ...]:
-        """Endpoints without TLS on a network, to listen at or to connect to."""
+        """Network endpoints without TLS, to listen on or to connect to."""
         return tuple(endpoint for endpoint in (*self.listen, *self.connect) if _open_to_network(endpoint))
 
     @property
@@ -157,12 +157,12 @@ class Listener:
     """Whether forged state is refused."""
 
     def grant(self, source: str) -> Grant:
-        """Rights of a source on this session."""
+        """Rights of a source in this session."""
         return EVERYTHING if self.grants is None else self.grants.get(owner_of(source), OBSERVING)
 
 
 def listeners(config: ZenohConfig) -> list[Listener]:
-    """The sessions of a robot; the first one serves all stations and the fleet."""
+    """Return the sessions of a robot; the first one serves all stations and the fleet."""
     tls = config.tls
     guarded = config.access_control or tls is not None
     grants = None if tls is None else tls.grants()
@@ -177,11 +177,11 @@ def listeners(config: ZenohConfig) -> list[Listener]:
 
 
 def session_config(robot: str, config: ZenohConfig, listener: Listener, *, probe: bool = False) -> str:
-    """Zenoh's own JSON configuration of one of the robot's sessions, or of a client that probes its endpoints.
+    """Return Zenoh's JSON configuration for one of the robot's sessions, or for a client that probes its endpoints.
 
-    No discovery at all, for fixed endpoints connect in milliseconds. A full transmit queue drops at once
-    (``wait_before_drop`` 0) because a put happens on the event loop; each is deep enough for the largest message.
-    No shared memory: it takes 20 MB and a thread, and is slower for scans.
+    Discovery is off because fixed endpoints connect within milliseconds. A full transmit queue drops messages
+    immediately (``wait_before_drop`` 0) because a put happens on the event loop; each queue is deep enough for the
+    largest message. Shared memory is off: it needs 20 MB and a thread, and is slower for scans.
     """
     # 2_000_000: time limit before a station is disconnected that does not take an answer (us), or a message that must
     # not be dropped. Zenoh's own 5 s are too long for requests that wait behind it; a large map needs some time as
@@ -227,7 +227,7 @@ def session_config(robot: str, config: ZenohConfig, listener: Listener, *, probe
 
 
 def _open_to_network(endpoint: str) -> bool:
-    """Whether an endpoint requires no certificate and is reachable from other machines."""
+    """Return whether an endpoint requires no certificate and is reachable from other machines."""
     if protocol_of(endpoint) in ("tls", "unixsock-stream", "serial"):
         return False
     host = host_of(endpoint)

@@ -1,7 +1,7 @@
 """Bridge between the in-process bus and Zenoh: state out, requests in, remote calls, liveliness.
 
-Zenoh calls back on its own threads; everything that touches the daemon hops onto the event loop first.
-Opening and closing block, so a thread does them.
+Zenoh calls back on its own threads; everything that touches the daemon is first passed to the event loop. Opening and
+closing block, so they run in a thread.
 """
 
 import asyncio
@@ -71,15 +71,15 @@ _SCHEMA_MEDIA = {
 
 
 class ZenohBridge:
-    """Service that carries one robot's bus over Zenoh.
+    """Service that connects one robot's bus to Zenoh.
 
     Args:
         robot: name in the keys ``mt/<robot>/...``.
-        bus: the robot's bus; everything but requests goes out, requests come in.
+        bus: the robot's bus; requests come in, all other messages go out.
         config: endpoints and access.
-        clock: time.
-        rpc: handlers behind ``rpc/<name>``; ``rpc/topics`` is added.
-        stand: accept poses of the robot from a test stand.
+        clock: time source.
+        rpc: handlers for ``rpc/<name>``; ``rpc/topics`` is added.
+        stand: whether to accept poses of the robot from a test stand.
     """
 
     name = ServiceName.ZENOH.value
@@ -98,7 +98,7 @@ class ZenohBridge:
         rpc.register("topics", self._topics, AccessRole.OBSERVER, recorded=False)
 
     async def open(self) -> None:
-        """Open the sessions and claim the robot's name; ``run`` does so as well, a daemon calls it first to fail early.
+        """Open the sessions and claim the robot's name. ``run`` does this too; a daemon calls it earlier to fail early.
 
         Raises:
             BusyError: an endpoint is in use, or another daemon already runs this robot.
@@ -108,7 +108,7 @@ class ZenohBridge:
             await in_thread(self._open)
 
     async def close(self) -> None:
-        """Close the sessions; ``run`` does so as well."""
+        """Close the sessions; ``run`` does this too."""
         await in_thread(self._close)
 
     async def run(self, ready: Ready) -> None:
@@ -211,7 +211,7 @@ class ZenohBridge:
         return session
 
     def _runs_elsewhere(self, listener: Listener) -> bool:
-        """Ask the fleet's routers as a client: its link is complete when it is open, a router's is not."""
+        """Ask the fleet's routers as a client: a client's link is complete once it is open, a router's link is not."""
         config = session_config(self._robot, self._config, listener, probe=True)
         try:
             with zenoh.open(zenoh.Config.from_json5(config)) as probe:
@@ -220,7 +220,7 @@ class ZenohBridge:
             return False
 
     def _declare_publishers(self) -> dict[str, tuple[Put, ...]]:
-        """Functions that publish to all sessions, by topic name."""
+        """Return the functions that publish to all sessions, by topic name."""
         return {
             topic.name: tuple(_publisher(session, topic, topic.key(self._robot)) for _, session in self._sessions)
             for topic in TOPICS
@@ -237,7 +237,7 @@ class ZenohBridge:
         limits: CallLimits,
         stand_intake: StandIntake,
     ) -> list[zenoh.LivelinessToken]:
-        """Subscribers and queryables, and last the liveliness tokens; each lives as long as its object."""
+        """Declare subscribers and queryables, then the liveliness tokens; each lives as long as its object."""
         remote = zenoh.Locality.REMOTE
         tokens = []
         for listener, session in self._sessions:
@@ -322,7 +322,7 @@ class ZenohBridge:
         replies.end(query, None if newest is None else partial(_reply_message, topic, key, newest))
 
     def _called(self, query: zenoh.Query) -> tuple[str, str | None]:
-        """Name and source of a call."""
+        """Return the name and the source of a call."""
         key = str(query.key_expr)
         return sender_in(self._robot, key) or (key.removeprefix(rpc_key(self._robot, "")), None)
 
@@ -377,7 +377,7 @@ class ZenohBridge:
         return partial(_reply_success, str(query.key_expr), data) if success else _error(data)
 
     def _described(self, query: zenoh.Query) -> list[tuple[str, Topic[Any]]]:
-        """Topics whose schema the query's key expression covers, with the schema's key."""
+        """Return the topics whose schema the query's key expression covers, each with the schema's key."""
         keys = [(rpc_key(self._robot, _SCHEMA_PREFIX + topic.name), topic) for topic in TOPICS]
         return [(key, topic) for key, topic in keys if query.key_expr.intersects(key)]
 
@@ -412,9 +412,10 @@ def _reply_schemas(described: list[tuple[str, Topic[Any]]], query: zenoh.Query) 
 
 
 def _publisher(session: zenoh.Session, topic: Topic[Any], key: str) -> Put:
-    """Put function of one topic; a full queue drops the message rather than stalling the loop.
+    """Return the put function for one topic; if the queue is full, it drops the message instead of blocking the loop.
 
-    Each priority has its own queue: other programs use Zenoh's ordinary one, and neither they nor answers delay ours.
+    Each priority has its own queue: other programs use Zenoh's default priority, so neither they nor answers delay the
+    topics.
     """
     priority = zenoh.Priority.DATA_LOW if topic.name in BULKY else zenoh.Priority.DATA_HIGH
     if topic.retained:
@@ -437,7 +438,7 @@ def _on_stand_pose(stand_intake: StandIntake, sample: zenoh.Sample) -> None:
 
 
 def _guarded(failed: "asyncio.Future[None]", job: Callable[[], object]) -> None:
-    """Run ``job``; a bug in it ends the service, and not only in the loop's exception handler."""
+    """Run ``job``; a bug in it ends the service instead of only reaching the loop's exception handler."""
     try:
         job()
     except Exception as bug:  # noqa: BLE001  # handed to the service's own coroutine

@@ -1,7 +1,7 @@
-"""Calibration of a truck: measured values with their uncertainty, the folder of their files, and their application.
+"""Calibration of a truck: measured values with their uncertainty, the folder of their files, and how they are applied.
 
 Files are numbered and dated, ``0003-2026-11-21T160102Z.json``; the latest is used. A file is written under another
-name, synced and then renamed, so after any crash the latest one is complete. No file is ever changed or removed: undo
+name, synced and then renamed, so after any crash the latest file is complete. No file is ever changed or removed: undo
 writes a newer file with the older value.
 """
 
@@ -92,7 +92,7 @@ class Estimate(Schema):
 
 
 class ValidUntil(Schema):
-    """Limits of an estimate's validity; the first one reached ends it."""
+    """Limits on an estimate's validity; the first limit reached ends it."""
 
     date: str
     """UTC"""
@@ -105,7 +105,7 @@ class ValidUntil(Schema):
 
 
 class Result(Schema):
-    """Result of one run of a wizard."""
+    """Result of one wizard run."""
 
     wizard: WizardName
     date: Date = ""
@@ -137,14 +137,14 @@ class Result(Schema):
         return next((estimate for estimate in self.estimates if estimate.name == name), None)
 
     def number(self, name: str) -> float:
-        """The value of an estimate that is there and is a number."""
+        """Value of an estimate that must exist and be a number."""
         estimate = self.estimate(name)
         assert estimate is not None
         return float(estimate.value)
 
 
 class CalibrationFile(Schema):
-    """All calibration results of one truck; replaced as a whole, never modified."""
+    """All calibration results for one truck; replaced as a unit, never modified."""
 
     version: Literal[1] = 1
     number: Annotated[int, Field(ge=1)]
@@ -158,7 +158,7 @@ class CalibrationFile(Schema):
 
 
 def utc(real_ns: int) -> str:
-    """Format a real (UNIX) time, ns, as ``YYYY-MM-DDThh:mm:ssZ``."""
+    """Format a real (UNIX) time in ns as ``YYYY-MM-DDThh:mm:ssZ``."""
     return f"{np.datetime64(real_ns // SECOND, 's')}Z"
 
 
@@ -166,10 +166,10 @@ _FILE_NAME: Final = re.compile(r"(\d{4,})-[0-9TZ-]+\.json")
 
 
 class CalibrationStore:
-    """Reads and writes the files of one truck; every method may block for file access.
+    """Reads and writes the calibration files of one truck; every method may block for file access.
 
     Args:
-        folder: folder of the files, created when the first file is written.
+        folder: folder for the files, created when the first file is written.
         robot: name of the truck.
     """
 
@@ -200,7 +200,7 @@ class CalibrationStore:
         """Load one file.
 
         Raises:
-            ConfigError: the file is damaged, too large, or of another truck; the message names the file and the remedy.
+            ConfigError: the file is damaged, too large, or another truck's; the message names the file and the remedy.
         """
         try:
             require_file(path, 1_000_000)  # maximum file size
@@ -227,10 +227,10 @@ class CalibrationStore:
 
         Args:
             result: measured estimates.
-            real_ns: real time now.
+            real_ns: current real (UNIX) time (ns).
 
         Raises:
-            ConfigError: the latest file is damaged, or the new one cannot be written; nothing is changed.
+            ConfigError: the latest file is damaged, or the new file cannot be written; nothing is changed.
         """
         with self._alone():
             current = self.current()
@@ -257,7 +257,7 @@ class CalibrationStore:
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
-        """Lock out other writers, in this process and others, between reading the latest file and writing the next one.
+        """Lock out other writers, in any process, while the latest file is read and the next one is written.
 
         Raises:
             ConfigError: the folder cannot be created or opened.
@@ -328,17 +328,17 @@ def put_values(data: dict[str, Any], results: Iterable[Result], source: Path | s
 
 
 def in_order(results: Iterable[Result]) -> list[tuple[Result, int, Estimate]]:
-    """Estimates that set a value, each with its result and its index in the result, latest last.
+    """Return the estimates that set a value, each with its result and its index in the result, latest last.
 
-    A partial measurement keeps old estimates, which may be older than another wizard's. If both set a value, the newer
-    estimate is used.
+    A partial measurement keeps old estimates, which may be older than another wizard's. If two wizards set one value,
+    the newer estimate is used.
     """
     rows = [(result, k, e) for result in results for k, e in enumerate(result.estimates) if e.key is not None]
     return sorted(rows, key=lambda row: (row[2].file, "" if row[2].file else row[2].date or row[0].date))
 
 
 def unused(config: TruckConfig, results: Iterable[Result]) -> list[str]:
-    """Keys of calibrated values without a place in ``config``: the device is missing or renamed."""
+    """Keys of calibrated values that have no place in ``config`` because the device is missing or renamed."""
     data = config.model_dump()
     keys = [estimate.key for _, _, estimate in in_order(results) if estimate.key is not None]
     return [key for key in dict.fromkeys(keys) if _section(data, key) is None]
@@ -364,13 +364,13 @@ def _section(data: dict[str, Any], key: str) -> dict[str, Any] | None:
 
 
 def may_set(wizard: WizardName, key: str) -> bool:
-    """Whether a wizard may set a value of the configuration, by ``WizardKind.keys``."""
+    """Return whether a wizard may set a value in the configuration, according to ``WizardKind.keys``."""
     names = key.split(".")
     return any(fits(names, pattern) for pattern in WIZARDS[wizard].keys)
 
 
 def value_at(config: Mapping[str, Any], key: str) -> Value | None:
-    """Return a value of a resolved configuration; None without its section."""
+    """Return a value from a resolved configuration; None if its section is missing."""
     section: Any = config
     for part in key.split("."):
         if not isinstance(section, Mapping):

@@ -45,8 +45,8 @@ def register(
         config: running configuration, including the calibration.
         loaded: calibration file in use.
         clock: clock for the dates of files.
-        events: sink of events, one for every new file.
-        offload: runs reads and writes of files.
+        events: receives events, one for every new file.
+        offload: runs file reads and writes.
         mode: returns the gate's current mode; files are written only while the truck is disarmed.
         watch: adds grades and expiry to results, and holds the proposal.
     """
@@ -115,7 +115,7 @@ def _result(payload: Any) -> Result:
     """Parse a result received from a client.
 
     Raises:
-        InputError: it is invalid.
+        InputError: the result is invalid.
     """
     try:
         return Result.model_validate_json(json.dumps(payload))

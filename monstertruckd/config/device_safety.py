@@ -99,7 +99,7 @@ BY_CELLS: Final = (
 
 
 def unattended_times(devices: Devices) -> Iterator[tuple[str, float]]:
-    """Times of drivers during which the truck continues unattended (s), by name."""
+    """Driver settings that let the truck continue unattended, each with its name and time (s)."""
     for role, device in devices.present().items():
         driver = device.driver
         for name in UNATTENDED.get(type(driver), ()):
@@ -107,13 +107,13 @@ def unattended_times(devices: Devices) -> Iterator[tuple[str, float]]:
 
 
 def beyond_devices(devices: Devices, monitors: Monitors, standstill: float, body: BodyLimits) -> Iterator[str]:
-    """Every device setting beyond the body's limits, with the limit.
+    """Return every device setting beyond the body's limits, with the limit.
 
     Args:
         devices: devices of the robot.
         monitors: monitors of the robot.
-        standstill: ``gate.standstill``, m/s.
-        body: limits of its motion.
+        standstill: ``gate.standstill`` (m/s).
+        body: limits of the body's motion.
     """
     for role, device in devices.present().items():
         driver = device.driver
@@ -167,7 +167,7 @@ def _usual_pack(pack: PackConfig) -> PackConfig:
 
 
 def packs(devices: Devices, monitors: Monitors) -> Iterator[tuple[str, PackConfig]]:
-    """Devices that measure the battery, with their place in the configuration."""
+    """Devices that measure the battery, each with its key in the configuration."""
     if isinstance(monitors.battery, PackConfig):
         yield "monitors.battery", monitors.battery
     for role, device in devices.present().items():

@@ -1,8 +1,8 @@
-"""Grades and validity of calibrations, and the service that monitors both.
+"""Grades and validity of calibrations, and the service that monitors them.
 
-Values based on an expired calibration are marked ``degraded``; the truck drives on. A calibration
-expires by time, by the distance driven since, or when the measured device was replaced (by its serial number, if USB
-gives one) or is on another port.
+Values based on an expired calibration are marked ``degraded``; the truck can still drive. A calibration expires by
+time, by the distance travelled since the calibration, or when the measured device was replaced (detected by its serial
+number, if USB provides one) or is on another port.
 """
 
 import itertools
@@ -49,7 +49,7 @@ _UNKNOWN: Final[Mapping[str, str]] = MappingProxyType({})
 
 
 def grade(wizard: WizardName, estimate: Estimate) -> Grade | None:
-    """Grade of an interval: A: as narrow as intended; B: at most twice as wide; C: wider; None: no goal."""
+    """Grade of an interval: A: as narrow as intended; B: at most twice as wide; C: wider; None: no target width."""
     goals = WIZARDS[wizard].goals
     goal = goals.get(estimate.name, goals.get(f"*_{estimate.name.rpartition('_')[2]}"))
     if goal is None or estimate.low is None or estimate.high is None:
@@ -61,7 +61,7 @@ def grade(wizard: WizardName, estimate: Estimate) -> Grade | None:
 
 
 def part_of(config: TruckConfig, role: str) -> str:
-    """Device of a role and its port; empty if there is none."""
+    """Device of a role and its port; empty if there is no such device."""
     device = config.devices.present().get(role)
     if device is None:
         return ""
@@ -71,7 +71,7 @@ def part_of(config: TruckConfig, role: str) -> str:
 
 
 def serials_of(tree: UsbTree) -> dict[str, str]:
-    """Serial numbers of the devices configured by hub and port, by role."""
+    """Serial numbers, by role, of the devices configured by hub and port."""
     return {node.role: node.serial for node in tree.nodes if node.role is not None and node.serial is not None}
 
 
@@ -93,7 +93,7 @@ def stamped(
 
 
 def worst(result: Result) -> Grade:
-    """Grade of a result: the worst grade of its estimates; C if no estimate has one."""
+    """Grade of a result: the worst grade among its estimates; C if no estimate has a grade."""
     grades = [g for e in result.estimates if (g := e.grade or grade(result.wizard, e)) is not None]
     return max(grades, default="C")
 
@@ -131,10 +131,10 @@ def _later(date: str, days: int) -> str:
 
 @dataclass
 class DistanceCounter:
-    """Total distance driven, m, kept across restarts.
+    """Total distance travelled (m), kept across restarts.
 
     Args:
-        file: file of the distance; None: not saved.
+        file: file for the distance; None if it is not saved.
     """
 
     file: Path | None
@@ -174,17 +174,17 @@ class DistanceCounter:
 
 
 class CalibrationWatch:
-    """Counts the distance driven, publishes the state of every calibration, and marks values based on expired ones.
+    """Counts the distance travelled, publishes the state of every calibration, and marks values based on expired ones.
 
     Args:
         config: running configuration.
         results: results of the calibration in use.
         bus: bus whose messages are marked.
-        clock: time.
-        events: sink of events, one for each expiry.
-        offload: runs writes of files.
-        odometer: total distance driven.
-        proposal: store of the trackers' proposal; None without one.
+        clock: time source.
+        events: receives events, one for each expiry.
+        offload: runs file writes.
+        odometer: total distance travelled.
+        proposal: store for the trackers' proposal; None without one.
     """
 
     name = ServiceName.CALIBRATION.value
@@ -214,7 +214,7 @@ class CalibrationWatch:
         self._serials: dict[str, str] = {}
 
     async def _begin(self) -> None:
-        """Read the distance; a damaged file is kept next to the new one."""
+        """Read the distance; a damaged file is kept next to the new file."""
         wrong, file = await self._offload(self.odometer.load), self.odometer.file
         if wrong and file is not None:
             where = await self._offload(lambda: put_aside(file))
@@ -238,7 +238,7 @@ class CalibrationWatch:
         await self._keep_proposal(proposal)
 
     async def close_proposal(self) -> None:
-        """Drop the proposal: the steering was calibrated, or its calibration undone."""
+        """Drop the proposal because the steering was calibrated, or its calibration was undone."""
         if self.proposal is not None:
             self.proposal.close()
             self._look()
@@ -330,5 +330,5 @@ class CalibrationWatch:
 
 
 def degraded_topics(expired: Iterable[str]) -> frozenset[str]:
-    """Topics that rest on expired wizards' results."""
+    """Topics that depend on expired results."""
     return frozenset(topic for name in expired for topic in WIZARDS[name].lifetime.topics)

@@ -1,7 +1,7 @@
 """Settings that can be changed while the robot runs, and their remote calls ``settings`` and ``set``.
 
-A setting is live if its model marks it (``monstertruck_schemas.base.LIVE``). After every change the whole configuration
-is validated as at the start, so that no value exceeds the limits of the body.
+A setting is live if its model marks it (``monstertruck_schemas.base.LIVE``). After every change the complete
+configuration is validated as at the start, so that no value exceeds the limits of the body.
 """
 
 import asyncio
@@ -29,7 +29,7 @@ SET: Final = "set"
 
 
 def with_settings(config: T, values: Mapping[str, Any]) -> T:
-    """Return ``config`` with other values of live settings, validated as a whole.
+    """Return ``config`` with new values for live settings, validated as a unit.
 
     Raises:
         InputError: a setting is unknown or not live, or a value is invalid; the message lists the possible values.
@@ -53,9 +53,9 @@ class LiveConfig:
 
     Args:
         config: configuration at the daemon's start.
-        apply: applies the settings to every part, between two ticks of the gate.
-        events: sink of events, one for every change, with its author.
-        offload: runs validation and writes of files.
+        apply: applies the settings to every component, between two ticks of the gate.
+        events: receives events, one for every change, with its author.
+        offload: runs validation and file writes.
     """
 
     def __init__(

@@ -52,7 +52,7 @@ YAML_1_1 = ("yes", "no", "on", "off")
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Place of a value in a file."""
+    """Position of a value in a file."""
 
     file: Path
     line: int
@@ -85,7 +85,7 @@ class Tree:
 
 
 def load_truck(path: Path) -> tuple[TruckConfig, Tree]:
-    """Load the configuration at ``path`` with the saved settings and the calibration of its robot.
+    """Load the configuration at ``path`` with its robot's saved settings and calibration.
 
     Raises:
         ConfigError: one line per error in the file, the saved settings or the calibration.
@@ -106,7 +106,7 @@ def load_config(path: Path, model: type[S]) -> tuple[S, Tree]:
 
 
 def resolved(config: Schema) -> dict[str, Any]:
-    """Return the whole configuration as plain data, including defaults."""
+    """Return the complete configuration as plain data, including defaults."""
     dumped: dict[str, Any] = TypeAdapter(type(config)).dump_python(config, mode="json")
     return dumped
 
@@ -161,7 +161,7 @@ def calibrated(config: T, tree: Tree, without: Collection[Path] = ()) -> tuple[T
 
 
 def _is_valid(config: TruckConfig, results: Collection[Result], path: Path) -> bool:
-    """Whether the configuration accepts a calibration without saved settings."""
+    """Return whether the configuration accepts a calibration without saved settings."""
     data = config.model_dump()
     put_values(data, results, path)
     try:
@@ -300,7 +300,7 @@ def load_tree(path: Path) -> Tree:
 
 
 def _named(value: Any, robot: str) -> Any:
-    """Replace the placeholder by the robot's name."""
+    """Replace the placeholder with the robot's name."""
     match value:
         case str():
             return value.replace(PLACEHOLDER, robot)
@@ -323,7 +323,7 @@ def _load(path: Path, including: tuple[Path, ...], inherited: int | None) -> Tre
 
 
 def included(path: Path, name: str) -> Path:
-    """Path of the file ``name`` in the file ``path``: relative to its folder, with links resolved.
+    """Path of the file ``name`` included by the file ``path``: relative to its folder, with links resolved.
 
     Contains no ``..`` unless it follows a link to a folder.
     """
@@ -366,7 +366,7 @@ def _merge(base: Tree, top: Tree) -> None:
 
 
 def _merge_values(below: dict[str, Any], above: dict[str, Any], prefix: Key, replaced: set[Key]) -> None:
-    """Collects in ``replaced`` the keys whose whole value comes from ``above``."""
+    """Merge ``above`` into ``below``; collect in ``replaced`` the keys whose complete value comes from ``above``."""
     for name, value in above.items():
         key = (*prefix, name)
         if isinstance(value, dict) and isinstance(below.get(name), dict) and not _other_kind(below[name], value):
@@ -377,7 +377,7 @@ def _merge_values(below: dict[str, Any], above: dict[str, Any], prefix: Key, rep
 
 
 def _other_kind(below: dict[str, Any], above: dict[str, Any]) -> bool:
-    """Whether ``above`` chooses another ``kind``, so that the keys ``below`` do not apply."""
+    """Return whether ``above`` chooses another ``kind``, so that the keys ``below`` do not apply."""
     return "kind" in above and above["kind"] != below.get("kind", above["kind"])
 
 
@@ -437,7 +437,7 @@ def _build_mapping(node: Node, builder: _Builder, key: Key) -> dict[str, Any]:
 
 
 def reader() -> YAML:
-    """Reads one document of plain data; ``_build`` bounds the expansion of aliases."""
+    """Return a reader for one document of plain data; ``_build`` bounds the expansion of aliases."""
     # 5_000: maximum number of keys and values in one file, read in a quarter of a second; a full configuration has a
     # few hundred
     return bounded_yaml(5_000, expand=False)
@@ -478,7 +478,7 @@ def _check_directives(text: str, path: Path) -> None:
 
 
 def _meant(path: Path) -> Path | None:
-    """A configuration of a similar name, in the same folder or the shipped ones."""
+    """Return a configuration with a similar name, in the same folder or among the shipped ones."""
     for folder in (path.parent, path.parent / "configs"):
         files = {file.name: file for file in sorted(folder.glob("*.yaml"))}
         for name in difflib.get_close_matches(path.name, files, 1):
@@ -491,10 +491,10 @@ class YamlText:
 
     Args:
         text: content.
-        path: its file, for error messages.
+        path: file of the text, for error messages.
 
     Raises:
-        ConfigError: it is not YAML 1.2, is nested too deeply, or is something else than a mapping.
+        ConfigError: the text is not YAML 1.2, is nested too deeply, or is not a mapping.
     """
 
     def __init__(self, text: str, path: Path) -> None:
@@ -506,7 +506,7 @@ class YamlText:
         """Content of a file.
 
         Raises:
-            ConfigError: it cannot be read, is longer than ``LARGEST_YAML``, or is refused as above.
+            ConfigError: the file cannot be read, is longer than ``LARGEST_YAML``, or is refused as described above.
         """
         try:
             require_file(path, LARGEST_YAML)
@@ -522,16 +522,16 @@ class YamlText:
         self.root = _compose(text, self.path)
 
     def node(self, *key: str) -> Node | None:
-        """The node at ``key``; None if there is none."""
+        """Return the node at ``key``, or None."""
         return next((value for _, value in self._pairs(key)), None)
 
     def value(self, *key: str) -> str | None:
-        """The plain value at ``key`` as it is written, without quotes; None for anything else."""
+        """Return the plain value at ``key`` as written, without quotes; None for anything else."""
         node = self.node(*key)
         return node.value if isinstance(node, ScalarNode) else None
 
     def replace(self, key: tuple[str, ...], text: str) -> bool:
-        """Write ``text`` where the value at ``key`` stands; False if there is none."""
+        """Replace the value at ``key`` with ``text``; return False if there is no value."""
         node = self.node(*key)
         if node is None:
             return False
@@ -539,7 +539,7 @@ class YamlText:
         return True
 
     def rename(self, key: tuple[str, ...], name: str) -> bool:
-        """Rename the last part of ``key`` (``*`` matches any name); False if it is missing."""
+        """Rename the last part of ``key`` (``*`` matches any name); return False if the key is missing."""
         text = self.text
         places = {(node.start_mark.index, node.end_mark.index) for node, _ in self._pairs(key)}
         for start, end in sorted(places, reverse=True):
@@ -561,7 +561,7 @@ class YamlText:
 
 
 def _end(node: Node) -> int:
-    """Index after the node's last character; the end mark of a block is after the blanks and comments behind it."""
+    """Index after the node's last character; a block's end mark comes after the blanks and comments that follow it."""
     if isinstance(node, CollectionNode) and not node.flow_style and node.value:
         last = node.value[-1]
         return _end(last[1] if isinstance(last, tuple) else last)
@@ -671,7 +671,7 @@ def _require_kind(data: dict[str, Any], path: Path, model: type[Schema]) -> None
 
 
 def _locate_files(tree: Tree, keys: tuple[tuple[str, ...], ...]) -> None:
-    """Make the paths at ``keys`` absolute; they are relative to their file."""
+    """Make the paths at ``keys`` absolute; in the file they are relative to it."""
     for key in keys:
         section: Any = tree.data
         for part in key[:-1]:
@@ -687,8 +687,8 @@ def _located(tree: Tree, key: tuple[str, ...], name: str) -> Path:
     """Resolve the file ``name`` at ``key``, or the folder of a saved map; record it if it belongs to the robot.
 
     Raises:
-        ConfigError: it is missing, or is a folder.
-        OSError, ValueError: the name is impossible for a file.
+        ConfigError: the file is missing, or is a folder.
+        OSError, ValueError: the file name is impossible.
     """
     origin = tree.origins[key]
     file = (origin.file.parent / name).resolve()
@@ -707,7 +707,7 @@ def _located(tree: Tree, key: tuple[str, ...], name: str) -> Path:
 
 
 def _give_ports(data: dict[str, Any]) -> None:
-    """Set the port of every device of an emulated robot without a configured port, as created by `simulate`."""
+    """Set the port of every emulated device without a configured port to the port that `simulate` creates."""
     devices = data.get("devices")
     if data.get("sim") is None or not isinstance(devices, dict):
         return
@@ -770,7 +770,7 @@ def _sentence(detail: ErrorDetails, model: type[Schema], key: Key) -> str:
 
 
 def _data_key(data: Any, loc: tuple[int | str, ...]) -> Key:
-    """Pydantic's location without the names of union members, which are not keys of the data."""
+    """Return pydantic's location without the names of union members, which are not keys in the data."""
     key: list[str | int] = []
     for index, part in enumerate(loc):
         last = index == len(loc) - 1
@@ -803,7 +803,7 @@ def _field_names(model: type[BaseModel], key: Key, detail: ErrorDetails) -> list
 
 
 def _tags(model: type[BaseModel]) -> set[str]:
-    """Values of its keys with a single choice: the kind, or the action of a mission step."""
+    """Values of the model's keys with a single choice: the kind, or the action of a mission step."""
     fields = model.model_fields.values()
     choices = [get_args(field.annotation) for field in fields if get_origin(field.annotation) is Literal]
     return {some[0] for some in choices if len(some) == 1}

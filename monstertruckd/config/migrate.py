@@ -33,7 +33,7 @@ class Upgrade:
 
 
 def plan(path: Path, steps: Mapping[int, Step] = STEPS, target: int = FILE_VERSION) -> list[Upgrade]:
-    """Upgrades of ``path`` and of all included files, in the order of writing.
+    """Return the upgrades for ``path`` and all included files, in writing order.
 
     Args:
         path: configuration file.

@@ -1,7 +1,7 @@
-"""Check the settings outside the gate that must match its speed; the message names each that does not.
+"""Check of the settings outside the gate that must match its speed; the message names each setting that does not.
 
 With a mismatch the robot would fail later, at a higher speed: its estimated pose would no longer follow its motion, or
-its route would end in an unseen obstacle. Speeds in m/s, distances in m.
+its route would end in an unseen obstacle. Speeds are in m/s, distances in m.
 """
 
 from collections.abc import Iterator
@@ -28,11 +28,11 @@ def too_slow(
     *,
     consistent: bool,
 ) -> Iterator[str]:
-    """Every setting too low for ``gate.speed``, with its required value.
+    """Return every setting that is too low for ``gate.speed``, with its required value.
 
     Args:
-        speed: ``gate.speed``, m/s.
-        odometry: odometry settings; other arguments likewise.
+        speed: ``gate.speed`` (m/s).
+        odometry: odometry settings.
         tracker: tracker settings; None without a tracker.
         planner: planner settings; None without a planner.
         slam: mapping settings; None without mapping.
@@ -64,6 +64,6 @@ def too_slow(
 
 
 def distance_to_stop(speed: float, planner: PlannerConfig, tracker: TrackerConfig) -> float:
-    """Distance travelled from the first scan that shows a blocked route until the tracker stops, m."""
+    """Distance travelled from the first scan that shows a blocked route until the tracker stops (m)."""
     noticed = planner.blocked_scans / planner.rate
     return speed * noticed + speed**2 / (2 * tracker.deceleration)

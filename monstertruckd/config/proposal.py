@@ -1,8 +1,8 @@
-"""Calibration proposed by trackers: learnt while driving, kept across restarts, used after an operator accepts it.
+"""Calibration proposed by trackers: learned while driving, kept across restarts, used after an operator accepts it.
 
 A tracker learns gain and trim of an axle with their covariance. If they differ significantly from the calibration, the
-tracker proposes the pulse map that would steer the axle as requested. Nothing uses it until an operator accepts it
-(``calibrate accept``). A proposal learnt with a calibration other than the current one is void.
+tracker proposes the pulse map that would steer the axle as requested. Nothing uses the proposal until an operator
+accepts it (``calibrate accept``). A proposal learned with a calibration other than the current one is void.
 """
 
 import math
@@ -40,12 +40,12 @@ class _File(Schema):
 
 @dataclass
 class SteeringProposal:
-    """Store of the latest proposal.
+    """Store for the latest proposal.
 
     Args:
         config: running configuration, including the calibration.
-        base: calibration file in use; empty: none.
-        file: file of the proposal; None: not saved.
+        base: calibration file in use; empty if there is none.
+        file: file for the proposal; None if it is not saved.
     """
 
     config: TruckConfig
@@ -79,11 +79,11 @@ class SteeringProposal:
         return ""
 
     def put_aside(self) -> str:
-        """Rename a damaged file; may block. Return a sentence about it."""
+        """Rename a damaged file and return a sentence about it; may block."""
         return "" if self.file is None else put_aside(self.file)
 
     def save(self) -> None:
-        """Write the file, or remove it without a proposal; may block.
+        """Write the file, or remove it if there is no proposal; may block.
 
         Raises:
             OSError: the file cannot be written.
@@ -101,7 +101,7 @@ class SteeringProposal:
 
         Args:
             state: latest state of the tracker.
-            date: current time, UTC.
+            date: current time (UTC).
         """
         if self._closed or not WIZARDS[WIZARD].fits(self.config):
             return False
@@ -120,11 +120,11 @@ class SteeringProposal:
         return True
 
     def close(self) -> None:
-        """Drop the proposal: the steering was calibrated, or its calibration undone."""
+        """Drop the proposal because the steering was calibrated, or its calibration was undone."""
         self.result, self._closed = None, True
 
     def _news(self, estimates: list[Estimate]) -> bool:
-        """Whether any value differs, or is proposed for the first time."""
+        """Return whether any value differs, or is proposed for the first time."""
         for new in estimates:
             old = None if self.result is None else self.result.estimate(new.name)
             if old is None or old.low is None or old.high is None or not old.low <= new.value <= old.high:
@@ -167,6 +167,6 @@ class SteeringProposal:
         )
 
     def _servo(self, axle: str, angle: float) -> float:
-        """Servo angle for an axle's angle with the other axle straight (rad)."""
+        """Servo angle (rad) for an axle angle while the other axle is straight."""
         front, rear = self._chassis.servos(*((angle, 0.0) if axle == "front" else (0.0, angle)))
         return math.remainder(front if axle == "front" else rear, math.tau)

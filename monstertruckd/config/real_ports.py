@@ -17,13 +17,13 @@ PSEUDO: Final = (Path("/dev/pts"), Path("/dev/shm"))  # noqa: S108 - nothing is 
 
 
 def real_ports(devices: Devices, machine: Path) -> tuple[str, ...]:
-    """Roles of the real devices: by hub on the computer's USB tree, by a node in /dev, or at another address.
+    """Roles of the real devices, which are configured by USB hub and port, by a node in /dev, or by another address.
 
     Links are followed. A port that does not exist yet is judged by its name.
 
     Args:
         devices: devices with their ports.
-        machine: root of the computer's tree.
+        machine: root of the computer's file system.
     """
     own_tree = _resolved(machine) == Path("/")
     return tuple(role for role, device in devices.present().items() if _is_real(device.port, own_tree=own_tree))
@@ -32,11 +32,11 @@ def real_ports(devices: Devices, machine: Path) -> tuple[str, ...]:
 def mixed(
     devices: Devices, machine: Path, *, simulated: bool, stand: str
 ) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], str]]:
-    """Keys of a simulation in a configuration with a real port.
+    """Simulation keys in a configuration with a real port.
 
     Args:
         devices: devices with their ports.
-        machine: root of the computer's tree.
+        machine: root of the computer's file system.
         simulated: whether there is a section ``sim``.
         stand: value of ``stand``.
 

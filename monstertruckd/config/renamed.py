@@ -27,7 +27,7 @@ Saved settings and calibrations do not record the version of their keys, so name
 
 
 def present_key(key: str) -> str:
-    """Current name of a dotted key of any version."""
+    """Current name of a dotted key from any version."""
     names = key.split(".")
     for renamed in RENAMED.values():
         for old, name in renamed.items():
@@ -38,6 +38,6 @@ def present_key(key: str) -> str:
 
 
 def fits(names: Sequence[str], pattern: str) -> bool:
-    """Whether a key matches a dotted pattern (``*`` matches any name)."""
+    """Return whether a key matches a dotted pattern (``*`` matches any name)."""
     parts = pattern.split(".")
     return len(parts) == len(names) and all(part in ("*", name) for part, name in zip(parts, names, strict=True))

@@ -1,4 +1,4 @@
-"""Start of a daemon: its configuration, with saved settings and calibration if their files are usable."""
+"""Start of a daemon: loads its configuration, with saved settings and calibration if their files are usable."""
 
 from collections.abc import Awaitable, Callable, Iterable
 from functools import partial
@@ -16,7 +16,7 @@ T = TypeVar("T", bound=TruckConfig)
 
 
 class LeftOut(NamedTuple):
-    """A damaged or invalid file that the daemon ignores at its start."""
+    """A damaged or invalid file that the daemon ignores when it starts."""
 
     file: Path
     source: str
@@ -28,11 +28,11 @@ class LeftOut(NamedTuple):
 def started(config: T, tree: Tree) -> tuple[T, Tree, tuple[LeftOut, ...]]:
     """Return the configuration as ``calibrated`` does, without unusable saved settings and calibrations.
 
-    The configuration's settings replace saved ones, and the previous calibration replaces a damaged one. The files
-    keep their names until ``set_aside``.
+    Unusable saved settings are replaced by the configuration's settings, a damaged calibration by the previous one. The
+    files keep their names until ``set_aside``.
 
     Raises:
-        ConfigError: the calibration is of another truck, or its folder cannot be read.
+        ConfigError: the calibration is for another truck, or its folder cannot be read.
     """
     left: dict[Path, LeftOut] = {}
     while True:
@@ -53,10 +53,10 @@ def _left_out(error: UnusableFileError, settings: Path) -> LeftOut:
 async def set_aside(
     left_out: Iterable[LeftOut], store_stop: Callable[[], Awaitable[bool]], offload: Offload
 ) -> tuple[LeftOut, ...]:
-    """Rename ignored files, so that they are kept and do not block later saves; see ``put_aside``.
+    """Rename ignored files so that they are kept and do not block later saves; see ``put_aside``.
 
-    The latched emergency stop is stored first: if this start crashed afterwards, the next would otherwise begin without
-    the stop.
+    The latched emergency stop is stored first: if this start crashed afterwards, the next start would otherwise begin
+    without the stop.
 
     Args:
         left_out: ignored files.

@@ -291,7 +291,7 @@ class TruckConfig(Schema):
             yield from weaker("consistency", self.consistency, usual, above, ())
 
     def missing_actuators(self) -> str | None:
-        """Devices that the body needs to drive and steer, but that are missing."""
+        """Missing devices without which the body cannot drive and steer."""
         chassis = self.chassis()
         needed = (*SHAFTS[: len(chassis.shafts)], *((DeviceRole.STEERING,) if chassis.steered else ()))
         steering = self.devices.steers()
@@ -420,7 +420,7 @@ class TruckConfig(Schema):
                 raise ValueError(f"planner.steering {planner.steering}: impossible for body {self.body.kind}: {why}")
 
     def _check_braking(self, role: str, limits: MotorLimits) -> None:
-        """The gate promises stopping distances; the drive controller must brake at least as hard."""
+        """Check that the drive controller brakes at least as hard as the gate's stopping distances assume."""
         train = DriveTrain(self.geometry.drive_ratio, self.geometry.wheel_radius)
         for name, promised, rate in (
             ("deceleration", self.gate.deceleration, limits.deceleration),

@@ -427,7 +427,7 @@ class WizardRun(NamedTuple):
 def sequence() -> Iterator[WizardRun]:
     """Yield all steps in the order of ``calibrate all``.
 
-    After the steps they need, otherwise in the order of the wizards.
+    Each step follows the steps it needs; otherwise the order of the wizards applies.
     """
     runs = {f"{row.name}.{step.complete}": WizardRun(row, step) for row in _ROWS for step in row.steps}
     done: set[str] = set()

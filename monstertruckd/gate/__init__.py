@@ -1,1 +1,1 @@
-"""The safety gate: the only writer of actuators."""
+"""The safety gate: the only component that writes to the actuators."""

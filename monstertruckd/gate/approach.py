@@ -1,4 +1,4 @@
-"""Approach to obstacles: speed limits by the free distance, with hysteresis, and the emergency stop criterion."""
+"""Approach to obstacles: speed limits based on the free distance, with hysteresis, and the emergency stop criterion."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -11,17 +11,17 @@ from monstertruckd.gate.config import GateConfig
 
 
 def comfortable_speed(room: float, delay: float, deceleration: float) -> float:
-    """Maximum speed of a body that brakes after ``delay`` s and stops within ``room`` metres, m/s."""
+    """Maximum speed (m/s) of a body that brakes after ``delay`` s and stops within ``room`` metres."""
     return deceleration * (math.sqrt(delay**2 + 2 * max(room, 0.0) / deceleration) - delay)
 
 
 def stopping(speed: float, delay: float, deceleration: float) -> float:
-    """Stopping distance of a body that brakes from ``speed`` (m/s) after ``delay`` s, m."""
+    """Stopping distance (m) of a body that brakes from ``speed`` (m/s) after ``delay`` s."""
     return speed * delay + speed**2 / (2 * deceleration)
 
 
 def reach(config: GateConfig, delay: float) -> float:
-    """Length of the sweep against obstacles seen ``delay`` s ago, m."""
+    """Length of the sweep against obstacles that were seen ``delay`` s ago (m)."""
     return config.obstacle.ahead + stopping(config.speed, delay, config.obstacle.deceleration)
 
 
@@ -42,7 +42,7 @@ class Approach:
         """Distance the footprint can travel, m; None without an obstacle within the checked distance."""
 
     def forget(self) -> None:
-        """Reset the state when no source drives."""
+        """Reset the state while no source drives."""
         self.blocked = self.emergency = False
         self.free = None
 
@@ -60,7 +60,7 @@ class Approach:
         """Update ``emergency``.
 
         Args:
-            now: ns.
+            now: current time (ns).
             twists: motions of the base per metre of pace.
             too_near: whether an ordinary stop from a pace (m/s) needs more than the free distance.
         """
@@ -71,7 +71,7 @@ class Approach:
         self.emergency = approaching and (self.emergency or (self.blocked and too_near(speed)))
 
     def free_distance(self, age: float | None) -> Measurement:
-        """Free distance as a measurement; ``age`` (s) is the age of its sample."""
+        """Free distance as a measurement; ``age`` (s) is the age of the sample behind it."""
         return Measurement(
             name="free distance", value=self.free, unit="m", limit=self._view.config.obstacle.ahead, age=age
         )

@@ -3,21 +3,21 @@
 Rules:
 
 - A valid request has this run's nonce and a sequence number above the latest number of its source and kind.
-- While the lease of a source runs, no other program can take over its name.
+- While a source holds a lease, no other program can take over its name.
 - A request that may set the truck in motion must carry the stamp of a recent gate state, which proves that it has not
   waited long in a queue. The stamp comes from the robot's clock, so no other clock has to be trusted.
-- Operators send from outside, the tracker from inside; a tracker on another machine must be listed in the
-  configuration.
-- The source of the highest role with a valid lease drives. Among equal roles the driving source keeps control, except
-  that a planner of the robot that requests motion precedes a planner that requests standstill.
-- Control passes to a higher role at once, to a lower role only after a new ARM order: once a role has driven, or has
-  ordered a stop, lower roles are refused until the truck is armed again. So a tracker never continues by itself after
-  an operator has released the stick.
+- Operators send requests from outside the daemon, the tracker from inside; a tracker on another machine must be listed
+  in the configuration.
+- The source with the highest role and a valid lease drives. Among equal roles the driving source keeps control, except
+  that a planner of the robot that requests motion takes precedence over a planner that requests standstill.
+- Control passes to a higher role immediately, but to a lower role only after a new ARM order: once a role has driven
+  or ordered a stop, requests from lower roles are refused until the truck is armed again. So a tracker never resumes by
+  itself after an operator has released the stick.
 - After a STOP order every source, even a new source, must send a neutral request before it may drive again. For a
-  source that was driving, silence for its lease is equivalent. A new ARM order ends this rule.
-- An ARM order with ``hold`` blocks planners until an ARM order without it.
-- A driving operator may hand over to an operator who has asked. For a moment no other source of their priority may
-  drive; the former driver must first send a neutral request.
+  source that was driving, staying silent for the length of its lease is equivalent. A new ARM order ends this rule.
+- An ARM order with ``hold`` blocks planners until the next ARM order without ``hold``.
+- A driving operator may hand over to an operator who has asked for control. For a moment no other source of the same
+  priority may drive; the former driver must first send a neutral request.
 """
 
 from collections.abc import Iterable, Mapping
@@ -124,7 +124,7 @@ class Sources:
         return freshness(request, now, self._config.max_request_age) if reason is Reason.OK else reason
 
     def accept_planner_request(self, request: DriveRequest, now: int) -> Reason:
-        """Return OK, or why a drive request of the robot's planners is refused."""
+        """Return OK, or why a drive request from the robot's planners is refused."""
         if request.role is not Role.TRACKER:
             return Reason.BAD_ROLE
         return self._planner_requests.accept(request, self.nonce, now)
@@ -137,11 +137,11 @@ class Sources:
         return reason
 
     def stopped(self, source: str, now: int) -> None:
-        """Record a stop ordered by a source; refuse starting orders of other sources that did not know of it.
+        """Record a stop ordered by a source; refuse starting orders from other sources that did not know of the stop.
 
         Args:
             source: name of the source; empty if not authenticated, which differs from every source.
-            now: ns.
+            now: current time (ns).
         """
         if source != self._stop[0]:
             self._stop_of_others = self._stop
@@ -150,7 +150,7 @@ class Sources:
     def overtaken(self, request: ControlRequest) -> str:
         """Return another source that ordered a stop after the gate state known to the sender of a starting order.
 
-        Empty if no other source has.
+        Empty if there is no such source.
         """
         stopped_by, at = self._stop_of_others if request.source == self._stop[0] else self._stop
         if request.order not in STARTING or request.gate_stamp is None or request.gate_stamp >= at:
@@ -179,8 +179,8 @@ class Sources:
         """Return the source that may drive now.
 
         Args:
-            now: ns.
-            holder: key of the driving source.
+            now: current time (ns).
+            holder: key of the source that is driving.
         """
         able = [
             source
@@ -190,18 +190,18 @@ class Sources:
         return max(able, key=lambda source: (source.rank, source.requests_motion, source.key == holder), default=None)
 
     def ask(self, name: str, now: int) -> None:
-        """Record that an operator asks for the drive."""
+        """Record that an operator asks for control."""
         self._asking = {other: until for other, until in self._asking.items() if now <= until and other != name}
         while len(self._asking) >= 4:  # maximum number of operators who ask at once; one more replaces the oldest
             del self._asking[next(iter(self._asking))]
         self._asking[name] = now + ASKING
 
     def asking(self, now: int) -> tuple[str, ...]:
-        """Operators who ask for the drive, latest last."""
+        """Operators who are asking for control, latest last."""
         return tuple(name for name, until in self._asking.items() if now <= until)
 
     def hand_over(self, holder: Source, to: str, now: int) -> None:
-        """Hand the drive from ``holder`` to ``to``; ``holder`` must send a neutral request before driving again."""
+        """Hand control from ``holder`` to ``to``; ``holder`` must send a neutral request before driving again."""
         # The holder may have sent a later request since the tick that made it the holder.
         self._drive.get(holder.key, holder).held = True
         self._asking.pop(to, None)
@@ -210,15 +210,15 @@ class Sources:
         self._min_rank = min(self._min_rank, PRIORITY[Role.STATION])
 
     def handed_to(self, now: int) -> str | None:
-        """Operator who has just received the drive."""
+        """Operator who has just received control."""
         return self._handed[0] if self._handed is not None and now <= self._handed[1] else None
 
     def live_name(self, name: str, now: int) -> bool:
-        """Whether an external source with this name has a valid lease."""
+        """Return whether an external source with this name has a valid lease."""
         return any(not source.inside and source.request.source == name for source in self.live(now))
 
     def _waits(self, source: Source, now: int) -> bool:
-        """Whether the source must wait because another operator has just received the drive."""
+        """Return whether the source must wait because another operator has just received control."""
         to = self.handed_to(now)
         if to is None or (source.request.source == to and not source.inside):
             return False
@@ -236,7 +236,7 @@ class Sources:
         return Reason.LOWER_PRIORITY
 
     def requesting_motion(self, now: int) -> tuple[str, ...]:
-        """Names of operators with a valid lease who request motion; planners may request it while they wait."""
+        """Names of operators with a valid lease who request motion; planners are excluded."""
         return tuple(s.request.source for s in self.live(now) if s.request.role in OPERATORS and not s.neutral)
 
     def claim(self, role: Role) -> None:
@@ -244,17 +244,17 @@ class Sources:
         self._min_rank = max(self._min_rank, PRIORITY[role])
 
     def hold(self, now: int) -> None:
-        """Require a neutral request of every source before it may drive."""
+        """Require every source to send a neutral request before it may drive."""
         self._released = dict.fromkeys(source.key for source in self.live(now))
         for source in self._drive.values():
             source.held = True
 
     def _unheard(self, key: Key) -> bool:
-        """Whether a source was not live at the STOP order and has not been neutral since."""
+        """Return whether a source had no lease at the STOP order and has not sent a neutral request since."""
         return self._released is not None and key not in self._released
 
     def _remember_neutral(self, key: Key, released: dict[Key, None]) -> None:
-        """Add a source to the released sources; if there are too many, drop the least recent source without a lease."""
+        """Add a source to the released sources; if there are too many, drop the oldest source without a lease."""
         released.pop(key, None)
         others = [name for inside, name in released if not inside]
         if not key[0] and (crowd := crowded(others, key[1])):
@@ -265,10 +265,10 @@ class Sources:
         released[key] = None
 
     def release(self, *, planners: bool) -> None:
-        """End ``claim`` and ``hold``, because the truck was armed again.
+        """End ``claim`` and ``hold`` because the truck was armed again.
 
         Args:
-            planners: whether planners may drive as well.
+            planners: whether planners may also drive.
         """
         self._min_rank = 0 if planners else PRIORITY[Role.STATION]
         self._released = None
@@ -298,7 +298,7 @@ class EventLog:
     """Collects events between two ticks.
 
     Args:
-        interval: minimum time between two events of one reason and source, s; suppressed events are counted.
+        interval: minimum time between two events with the same reason and source (s); suppressed events are counted.
     """
 
     def __init__(self, interval: float) -> None:
@@ -322,14 +322,14 @@ class EventLog:
         """Add an event; repetitions within the interval only increase ``repeated`` of the next event.
 
         Args:
-            now: ns.
-            reason: reason of the event.
+            now: current time (ns).
+            reason: reason for the event.
             severity: severity of the event.
             text: message; by default the text of the reason.
             values: measurements behind the event.
             source: program or person concerned.
             always: whether the event is never suppressed, as for transitions.
-            lasting: whether to suppress the event as long as it repeats without a pause of the interval.
+            lasting: whether to keep suppressing the event until it has been absent for one interval.
         """
         key = (reason, source)
         # Maximum number of different events (reason and source) per interval: sources may invent any number of names.
@@ -361,7 +361,7 @@ class GateStateMachine:
     """States: disarmed > armed > driving > stopping > (armed | disarmed); an emergency stop from any state latches.
 
     Args:
-        events: receives the transitions.
+        events: log that receives the transitions.
         latched: whether the emergency stop is latched at the start.
     """
 
@@ -381,7 +381,7 @@ class GateStateMachine:
 
     @property
     def active(self) -> bool:
-        """Whether the truck is armed, drives, or is being stopped."""
+        """Whether the truck is armed, driving or being stopped."""
         return self.mode.active
 
     @property
@@ -424,7 +424,7 @@ class GateStateMachine:
         self.holder, self.driven = driver, now
 
     def stop(self, now: int, reasons: Iterable[Reason]) -> None:
-        """Begin to stop."""
+        """Start to stop the truck."""
         self._enter(GateMode.STOPPING, now)
         self._stopped_by = tuple(dict.fromkeys(reasons))
 
@@ -435,12 +435,12 @@ class GateStateMachine:
         self._events.emit(now, Reason.STOPPED, Severity.INFO, text)
 
     def rest(self, now: int) -> None:
-        """Return to armed: the stopped truck is at rest."""
+        """Return to armed because the stopped truck is at rest."""
         self._enter(GateMode.ARMED, now)
         self._events.emit(now, Reason.STOPPED, Severity.INFO, always=True)
 
     def disarm(self, now: int, text: str) -> None:
-        """Disarm; ``text`` is the reason in words."""
+        """Disarm; ``text`` states the reason."""
         self._enter(GateMode.DISARMED, now)
         self.disarm_at_rest = False
         self._events.emit(now, Reason.DISARMED, Severity.INFO, text, always=True)

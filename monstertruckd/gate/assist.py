@@ -1,7 +1,7 @@
-"""Assisted driving: turns an operator's motion to the nearest curvature whose swept ground is free.
+"""Assisted driving: steers an operator's motion to the nearest curvature whose swept ground is free.
 
-It never increases the operator's speed, and never changes a request for standstill. All checks of the gate treat the
-turned motion as if the operator had requested it.
+Assisted driving never increases the operator's speed and never changes a request for standstill. All checks of the gate
+treat the changed motion as if the operator had requested it.
 """
 
 import math
@@ -24,12 +24,12 @@ CHOICES: Final = 8
 
 
 def nearest_free(turns: Array, free: Array, needed: float) -> float:
-    """Return the smallest turn that leaves ``needed`` metres free, or else the one that leaves most.
+    """Return the smallest turn that leaves ``needed`` metres free, or else the turn that leaves most.
 
     Args:
-        turns: deviations from the asked motion, shape (n,), in any unit.
-        free: free distance of each, shape (n,), m.
-        needed: m.
+        turns: deviations from the requested motion, shape (n,), in any unit.
+        free: free distance for each turn (m), shape (n,).
+        needed: required free distance (m).
     """
     free = np.minimum(free, needed)
     best = np.flatnonzero(free >= free.max() - 1e-9)
@@ -37,18 +37,18 @@ def nearest_free(turns: Array, free: Array, needed: float) -> float:
 
 
 def free_distances(twists: Array, footprint: Footprint, margin: float, points: Array) -> Array:
-    """Return the distance a body can travel on the arcs of constant twists before it touches a point; +inf if never.
+    """Return the distance a body can travel along arcs of constant twist before it touches a point; +inf if never.
 
-    Discs cover the footprint. A point inside a disc counts only if the disc moves towards it.
+    Discs cover the footprint. A point inside a disc counts only if the disc moves towards the point.
 
     Args:
         twists: vx, vy, wz of the base per metre travelled, shape (k, 3).
-        footprint: outline.
-        margin: added on all sides, m.
-        points: in base, shape (n, 2), m.
+        footprint: outline of the body.
+        margin: clearance added on all sides (m).
+        points: points in the base frame (m), shape (n, 2).
 
     Returns:
-        Shape (k,), m.
+        Distances (m), shape (k,).
     """
     result = np.full(len(twists), math.inf)
     places, radius = footprint.covering_discs()
@@ -80,7 +80,7 @@ def free_distances(twists: Array, footprint: Footprint, margin: float, points: A
 
 
 class Assist(Check):
-    """Turns the requests of operators while ``gate.assist.on``; as a check, it reports when it does so.
+    """Adjusts the steering of operators' requests while ``gate.assist.on``; as a check, it reports when it does so.
 
     Args:
         view: limits, samples and motion.
@@ -99,7 +99,7 @@ class Assist(Check):
     def instead(self, request: DriveRequest | None, now: int) -> DriveRequest | None:
         """Return the request to drive, with an assisted turn; None if no request can be assisted.
 
-        The second control confirms only the ground on the requested motion.
+        The second control confirms only the ground along the requested motion.
         """
         self._turned = False
         view = self.view
@@ -149,6 +149,6 @@ class Assist(Check):
         return front, min(max(request.rear - turn, -most), most)
 
     def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
-        """Report that the motion is turned, without a speed limit."""
+        """Report that the steering is assisted, without a speed limit."""
         if courses and self._turned:
             yield PaceLimit(Reason.ASSISTED, self.view.motion.max_pace(courses[0][0]))

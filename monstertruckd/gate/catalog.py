@@ -1,4 +1,4 @@
-"""Catalog of gate checks that a configuration adds by ``kind``, from this repository or other distributions."""
+"""Catalog of gate checks that a configuration adds by ``kind``, from this repository or from other distributions."""
 
 from typing import Annotated, Any, Final, Literal, Self
 
@@ -34,12 +34,12 @@ class FreshConfig(CheckConfig):
 
     @property
     def row(self) -> Topic[Any]:
-        """Row of the topic in the topic table."""
+        """Entry for the topic in the topic table."""
         return BY_NAME[self.topic]
 
     @property
     def limit(self) -> float:
-        """Maximum age, s; +inf if neither the settings nor the topic has a limit."""
+        """Maximum age (s); +inf if neither the settings nor the topic has a limit."""
         return self.row.fresh_for() if self.within is None else self.within
 
     @model_validator(mode="after")

@@ -1,10 +1,10 @@
-"""Interface of the gate's checks: a check is one rule that may slow the robot or keep it at rest, and nothing else.
+"""Interface of the gate's checks. A check is one rule; it can only slow the robot or keep it at rest.
 
 The gate keeps an ordered list of checks, worst reasons first. Every check observes all messages received by the gate
-and every tick (``observe``). At each tick the gate asks it why the robot may not move at all (``reason``) and how fast
-it may go along the requested and commanded motions (``limit``); ``describe`` explains a reason with its measurements.
-The gate combines the union of all reasons and the minimum of all limits, so an additional check can only make it
-stricter.
+and every tick (``observe``). At each tick the gate asks the check why the robot may not move at all (``reason``) and
+how fast it may go along the requested and commanded motions (``limit``); ``describe`` explains a reason with its
+measurements. The gate combines the union of all reasons and the minimum of all limits, so an additional check can only
+make the gate stricter.
 """
 
 import math
@@ -35,7 +35,7 @@ GATE: Final = ServiceName.GATE.value
 
 
 class Tick(NamedTuple):
-    """Start of a tick of the gate, observed by checks like a message."""
+    """Start of a tick of the gate; checks observe it like a message."""
 
     now: int
     """Time of the tick, ns."""
@@ -52,7 +52,7 @@ class PaceLimit(NamedTuple):
 
 
 class DockArea(NamedTuple):
-    """Area in front of a dock, in base at the latest scan."""
+    """Area in front of a dock, in the base frame at the time of the latest scan."""
 
     docked: Pose2
     """Pose of the docked robot, turned so that its x axis leads into the dock."""
@@ -64,11 +64,11 @@ class DockArea(NamedTuple):
     without one."""
 
     def outside(self, points: Array) -> NDArray[np.bool_]:
-        """Whether each point (n, 2) in base (m) is outside the housing."""
+        """Return whether each point (m, base frame, shape (n, 2)) is outside the housing."""
         return np.ones(len(points), np.bool_) if self.housing is None else ~self._within(self.housing, points)
 
     def on_axis(self, points: Array) -> NDArray[np.bool_]:
-        """Whether each point (n, 2) in base (m) lies in the corridor."""
+        """Return whether each point (m, base frame, shape (n, 2)) lies in the corridor."""
         return self._within(self.corridor, points)
 
     def _within(self, box: tuple[float, float, float], points: Array) -> NDArray[np.bool_]:
@@ -119,12 +119,12 @@ class GateView:
 
     @property
     def calibrates(self) -> bool:
-        """Whether an operator has armed the robot to calibrate sensors on ground kept clear."""
+        """Whether an operator has armed the robot to calibrate sensors on ground that is kept clear."""
         return self._states.calibrates
 
     @property
     def planner(self) -> str | None:
-        """Planner of the robot that drives; None if none does."""
+        """The robot's planner that is driving; None if no planner drives."""
         holder = self._states.holder
         return holder.request.source if holder is not None and holder.inside else None
 
@@ -158,7 +158,7 @@ class Check:
 
     @property
     def urgent(self) -> bool:
-        """Whether only a quick stop avoids contact."""
+        """Whether only a quick stop can avoid contact."""
         return False
 
     @property
@@ -168,17 +168,17 @@ class Check:
 
     @property
     def findings(self) -> int:
-        """Motions so far that demanded an emergency stop."""
+        """Number of motions so far that required an emergency stop."""
         return 0
 
     @property
     def power_off(self) -> bool:
-        """Whether only switching off the power stages helps."""
+        """Whether the robot can be stopped only by switching off its power stages."""
         return False
 
     @property
     def port_off(self) -> bool:
-        """Whether only switching off the drives' ports helps."""
+        """Whether the robot can be stopped only by switching off the drives' ports."""
         return False
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
@@ -190,20 +190,20 @@ class Check:
         """
 
     def reason(self, now: int) -> Iterable[Reason]:
-        """Why the robot may not move at ``now`` (ns), worst first; called at ticks and for orders in between."""
+        """Return why the robot may not move at ``now`` (ns), worst first; called at ticks and for orders."""
         return ()
 
     def limit(self, now: int, courses: Sequence[Course] | None) -> Iterable[PaceLimit]:
-        """Limits of the pace at a tick.
+        """Speed limits at a tick.
 
         Args:
-            now: ns.
+            now: current time (ns).
             courses: requested and commanded motions; empty at standstill, None if no source drives.
         """
         return ()
 
     def text(self, reason: Reason) -> str:
-        """Wording of a reason of this check, for its event."""
+        """Text of a reason of this check, for its event."""
         return reason.text
 
     def figures(self, reason: Reason, now: int) -> Iterable[Measurement]:
@@ -211,13 +211,7 @@ class Check:
         return ()
 
     def describe(self, reason: Reason, now: int, since: int) -> Iterable[Cause]:
-        """Causes of a stop for a reason of this check.
-
-        Args:
-            reason: one of ``reasons``.
-            now: ns.
-            since: time when the gate first saw the reason, ns.
-        """
+        """Causes of a stop for a reason of this check."""
         yield Cause(
             reason=reason,
             source=GATE,
@@ -263,7 +257,7 @@ class Checks:
         return tuple(found)
 
     def limits(self, now: int, courses: Sequence[Course] | None) -> dict[Reason, float]:
-        """Minimum pace limit for each reason, m/s; arguments as for ``Check.limit``."""
+        """Minimum pace limit for each reason, m/s; for the arguments see ``Check.limit``."""
         found: dict[Reason, float] = {}
         for check in self._checks:
             for reason, pace in check.limit(now, courses):
@@ -309,12 +303,12 @@ class Checks:
         return reason.text if giver is None else giver.text(reason)
 
     def describe(self, reasons: Iterable[Reason], now: int, since: Mapping[Reason, int]) -> list[Cause]:
-        """Causes of a stop, with wording and measurements.
+        """Causes of a stop, with text and measurements.
 
         Args:
-            reasons: worst first.
-            now: ns.
-            since: time when the gate first saw each reason, ns.
+            reasons: reasons, worst first.
+            now: current time (ns).
+            since: time when the gate first saw each reason (ns).
         """
         causes: list[Cause] = []
         for reason in reasons:
@@ -326,6 +320,6 @@ class Checks:
         return causes
 
     def reset(self) -> None:
-        """Clear findings that stay until the gate disarms."""
+        """Clear findings that persist until the gate disarms."""
         for check in self._checks:
             check.reset()

@@ -1,8 +1,8 @@
 """Limits of the safety gate, and the physical limits of a body that no configuration may exceed.
 
-A speed is possible if the motor reaches it and the body can stop from it on seen ground. A time without samples is
-possible if the body travels no further than its own length meanwhile. A tilt is possible up to the slope where the
-wheels slip. Units: lengths m, angles rad, times s, speeds m/s.
+A speed is possible if the motor reaches it and the body can stop from it on ground that has been seen. A time without
+samples is possible if the body travels no further than its own length in that time. A tilt is possible up to the slope
+at which the wheels slip. Units: lengths m, angles rad, times s, speeds m/s.
 """
 
 import math
@@ -38,7 +38,7 @@ def _limit(topic: Topic[Any], *, critical: bool = True) -> SensorLimit:
 
 
 class Leases(Schema):
-    """Maximum lease granted to each role, s; longer requested leases are shortened."""
+    """Maximum lease granted to each role (s); longer requested leases are shortened."""
 
     hand: Annotated[float, Field(gt=0, le=1)] = 0.25
     gamepad: Annotated[float, Field(gt=0, le=1)] = 0.25
@@ -47,7 +47,7 @@ class Leases(Schema):
     tracker: Annotated[float, Field(gt=0, le=1)] = 0.25
 
     def of(self, role: Role) -> float:
-        """Maximum lease of a driving role, s."""
+        """Maximum lease of a driving role (s)."""
         cap: float = getattr(self, role.value)
         return cap
 
@@ -73,7 +73,7 @@ class TiltLimits(Schema):
 
 
 class SteeringCheckConfig(Schema):
-    """Detection of a measured yaw that contradicts the steering."""
+    """Detection of measured yaw that contradicts the steering."""
 
     window: Annotated[float, Field(gt=0, le=5)] = 2.0
     """Window for the comparison of turns, s."""
@@ -86,7 +86,7 @@ class SteeringCheckConfig(Schema):
 
 
 class AssistConfig(Schema):
-    """Assisted driving: an operator's motion is turned to the nearest curvature whose swept ground is free."""
+    """Assisted driving: an operator's motion is steered to the nearest curvature whose swept ground is free."""
 
     on: Annotated[bool, LIVE] = False
     """Whether assisted driving steers around obstacles; it never increases the operator's speed"""
@@ -157,7 +157,7 @@ class SonarLimits(Schema):
 
 
 class ShaftCheckConfig(Schema):
-    """Detection of a driven shaft that does not turn although commanded."""
+    """Detection of a driven shaft that does not turn when commanded."""
 
     within: Positive = 0.6
     """Time without turning that stops the truck, s."""
@@ -309,7 +309,7 @@ class GateConfig(Schema):
 
 
 class InForce:
-    """Limits in force; the owner replaces ``config`` between two ticks.
+    """Limits in force; the owner may replace ``config`` between two ticks.
 
     Args:
         config: initial limits.
@@ -342,7 +342,7 @@ class BodyLimits:
 
     @property
     def acceleration(self) -> float:
-        """Maximum acceleration that motors and wheels can hold, m/s^2."""
+        """Maximum acceleration that motors and wheels can sustain (m/s^2)."""
         gravity = 9.81
         return min(self.pull / self.mass, GRIP * gravity)
 
@@ -382,7 +382,7 @@ def impossible_settings(config: GateConfig, body: BodyLimits, times: Iterable[tu
 
 
 def _beyond_checks(config: GateConfig) -> Iterator[str]:
-    """Messages for settings of checks that could never stop a truck."""
+    """Messages for check settings that could never stop a truck."""
     if config.obstacle.deceleration > config.deceleration:
         yield (
             f"gate.obstacle.deceleration {config.obstacle.deceleration:g} m/s^2: at most gate.deceleration, "
@@ -397,20 +397,20 @@ def _beyond_checks(config: GateConfig) -> Iterator[str]:
 
 
 def stopping_distance(config: GateConfig) -> float:
-    """Worst-case distance from the place of the latest scan to standstill, m."""
+    """Worst-case distance from the position of the latest scan to standstill (m)."""
     delay = config.scan.stale_after + config.max_latency + config.reaction
     speed = config.speed  # a product cannot raise OverflowError, a power can
     return config.obstacle.ahead + speed * delay + speed * speed / (2 * config.deceleration)
 
 
 def required_sensors(config: GateConfig) -> dict[str, SensorLimit]:
-    """Limits, by key, of the sensors that by default stop the truck when stale."""
+    """Limits of the sensors that by default stop the truck when stale, by sensor key."""
     limits = ((name, limit) for name, limit in config if isinstance(limit, SensorLimit))
     return {name: limit for name, limit in limits if GateConfig.model_fields[name].default.critical}
 
 
 def unattended(config: GateConfig) -> Iterator[tuple[str, float]]:
-    """Settings that let the truck continue unattended for that time, s."""
+    """Settings that let the truck continue unattended, each with the time (s)."""
     for name, limit in required_sensors(config).items():
         yield f"gate.{name}.stale_after", limit.stale_after
     for name in ("max_latency", "reaction", "tick_stall", "max_request_age"):
@@ -527,7 +527,7 @@ def weakened(config: GateConfig) -> tuple[str, ...]:
 
 
 def weaker(section: str, config: Schema, usual: Schema, above: Iterable[str], below: Iterable[str]) -> Iterator[str]:
-    """Messages for settings weaker than usual, each with its value and the usual value.
+    """Messages for settings weaker than the usual ones, each with its value and the usual value.
 
     Args:
         section: section name for the messages.

@@ -1,4 +1,4 @@
-"""Check of sensor consistency: treats sensors contradicted by other measures of motion as lost."""
+"""Check of sensor consistency: sensors contradicted by other measurements of motion are treated as lost."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any, Final
@@ -18,7 +18,7 @@ ENOUGH: Final = 2
 
 
 class ConsistencyCheck(Check):
-    """Stops the robot on doubt about a sensor whose silence stops it; slows it without a second measure of motion.
+    """Stops the robot on doubt about a sensor whose silence stops it; slows it if only one sensor measures motion.
 
     A doubt about motion stops only an armed robot, and only if the doubt arose since arming: arming the robot again
     allows another try.
@@ -34,7 +34,7 @@ class ConsistencyCheck(Check):
         """Time up to when doubts about motion are ignored, ns."""
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
-        """Take the latest comparison; while the robot is disarmed, ignore doubts about its motion."""
+        """Process the latest comparison; while the robot is disarmed, ignore doubts about its motion."""
         if isinstance(seen, Consistency):
             self._newest = seen
         elif isinstance(seen, Tick) and not self.view.mode.active:
@@ -46,7 +46,7 @@ class ConsistencyCheck(Check):
         yield from dict.fromkeys(_reason(doubt) for doubt in doubts)
 
     def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
-        """Limit the speed for a frozen battery voltage, and for motion not confirmed by a second measure."""
+        """Limit the speed if the battery voltage is frozen, or if no second measurement confirms the motion."""
         config = self.view.config
         if any(doubt.sensor == DeviceRole.BATTERY for doubt in self._doubts()) and not config.battery.critical:
             yield PaceLimit(Reason.SENSOR_FROZEN, config.battery_low_speed)
@@ -69,7 +69,7 @@ class ConsistencyCheck(Check):
             yield Cause(reason=reason, source=doubt.sensor, since=doubt.since, text=text, measurements=(figure,))
 
     def text(self, reason: Reason) -> str:
-        """Both sensors and their difference, or the missing measure of motion."""
+        """Both sensors and their difference, or the missing measurement of motion."""
         if reason is Reason.UNWITNESSED:
             return self._lacking()
         texts = [f"{doubt.sensor}: {doubt.text}" for doubt in self._doubts() if _reason(doubt) is reason]
@@ -84,7 +84,7 @@ class ConsistencyCheck(Check):
                 yield doubt
 
     def _is_expected(self, doubt: Doubt) -> bool:
-        """Whether a robot armed to calibrate its sensors continues slowly despite this doubt."""
+        """Return whether a robot armed to calibrate its sensors continues slowly despite this doubt."""
         return self.view.calibrates and _reason(doubt) is Reason.SENSORS_DISAGREE
 
     def _lacking(self) -> str:
@@ -105,7 +105,7 @@ class ConsistencyCheck(Check):
         return len(newest.measures) >= ENOUGH
 
     def _stops(self, sensor: str) -> bool:
-        """Whether the robot stops when this sensor is silent."""
+        """Return whether the robot stops when this sensor is silent."""
         config = self.view.config
         limits = {
             DeviceRole.LIDAR.value: config.scan,

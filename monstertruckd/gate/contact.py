@@ -1,10 +1,10 @@
 """Detects contact while an operator drives into ground that no lidar has seen, and backs off.
 
-Four measures show that an obstacle holds the body while its wheels are driven: a motor draws more than its rolling
+Four measurements show that an obstacle holds the body while its wheels are driven: a motor draws more than its rolling
 current, a shaft or a free wheel is slower than commanded, the body turns less than commanded, or the scans show that
 the body stands still while its wheels roll. The gate compares them only while the commanded motion is steady, because a
 motor that accelerates its gears draws as much current as a motor that pushes. After a contact the gate reverses the
-last motion for a few centimetres. Then the robot stands until the operator releases the stick or requests another
+last motion for a few centimetres. Then the robot waits until the operator releases the stick or requests another
 direction.
 """
 
@@ -33,7 +33,7 @@ SETTLED: Final = SECOND // 10
 
 
 class ContactFinding(NamedTuple):
-    """Measure that revealed a contact."""
+    """Measurement that revealed a contact."""
 
     name: str
     """Name of the measure."""
@@ -43,7 +43,7 @@ class ContactFinding(NamedTuple):
 
 
 class Lasting:
-    """A condition that must hold for some time, by the stamps of the messages that show it."""
+    """A condition that must hold for some time, measured by the stamps of the messages that show it."""
 
     def __init__(self) -> None:
         self._since: int | None = None
@@ -94,7 +94,7 @@ class ContactCheck(Check):
         """Distance backed off, m."""
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
-        """Take the commanded motion of a tick, or a measurement of the actual motion."""
+        """Process the commanded motion of a tick, or a measurement of the actual motion."""
         match seen:
             case Tick():
                 self._follow(seen)
@@ -109,7 +109,7 @@ class ContactCheck(Check):
                 self._touch(ContactFinding("distance by the scans", body.shown, "m", least), seen.received)
 
     def instead(self, request: DriveRequest, now: int) -> DriveRequest:
-        """Return the request to be driven: the holder's request or, after a contact, its opposite."""
+        """Return the request to drive: the holder's request or, after a contact, the opposite motion."""
         self._request = request
         touched = self._touched
         if touched is None:
@@ -127,7 +127,7 @@ class ContactCheck(Check):
             yield PaceLimit(Reason.CONTACT, self.view.config.obstacle.confirmed_speed if self._backing(now) else 0.0)
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
-        """Measure that revealed the contact."""
+        """Measurement that revealed the contact."""
         if (found := self._finding) is not None:
             yield Measurement(name=found.name, value=found.value, unit=found.unit, limit=found.limit)
 
@@ -146,13 +146,13 @@ class ContactCheck(Check):
             self._backed += away * max(map(abs, speeds), default=0.0) * tick.elapsed / SECOND
 
     def _away(self, speeds: Sequence[float]) -> bool:
-        """Whether commanded shaft speeds lead away from the contact."""
+        """Return whether commanded shaft speeds lead away from the contact."""
         assert self._touched is not None
         towards = self.view.chassis.shafts_along(self.view.motion.target(self._touched).twist, *self.view.motion.angles)
         return sum(speed * other for speed, other in zip(speeds, towards, strict=True)) < 0.0
 
     def _backing(self, now: int) -> bool:
-        """Whether the robot still has to back off."""
+        """Return whether the robot still has to back off."""
         distance = self._config.back_off
         # The robot stops backing off after this multiple of the travel time for the distance at ``confirmed_speed``.
         patience = 2.0
@@ -163,7 +163,7 @@ class ContactCheck(Check):
         return self._leads(request, self.view.motion.target(other).twist)
 
     def _leads(self, request: DriveRequest, twist: Twist2) -> bool:
-        """Whether a request has the direction of a twist."""
+        """Return whether a request has the same direction as a twist."""
         asked = self.view.motion.target(request).twist
         return sum(a * b for a, b in zip(asked, twist, strict=True)) > 0.0
 
@@ -183,7 +183,7 @@ class ContactCheck(Check):
     # The measures
 
     def _driven(self, stamp: int) -> bool:
-        """Whether all shafts have held the speeds of a steady motion for ``SETTLED`` at ``stamp``, ns."""
+        """Return whether, at ``stamp`` (ns), all shafts have held the speeds of a steady motion for ``SETTLED``."""
         reached = self._reached.values()
         return len(reached) == len(self.view.motion.shaft_speeds) and stamp - max(reached) >= SETTLED
 
@@ -239,14 +239,14 @@ class ContactCheck(Check):
         self._compare("body", imu, math.hypot(rate.x, rate.y, rate.z), expected, "rad/s")
 
     def _compare(self, name: str, seen: Message, measured: float, expected: float, unit: str = "m/s") -> None:
-        """Begin to back off if a speed stays far below the expected one."""
+        """Start to back off if a speed stays far below the expected speed."""
         least = self._config.share * expected
         slow = self._slow.setdefault(name, Lasting())
         if slow.holds(seen.stamp, self._config.within, true=measured < least):
             self._touch(ContactFinding(f"speed of {name}", measured, unit, least), seen.received)
 
     def _touch(self, found: ContactFinding, now: int) -> None:
-        """Begin to back off if the robot drives into unseen ground or near a dock, but not away from the contact."""
+        """Start to back off if the robot drives into unseen ground or near a dock, but not away from the contact."""
         view = self.view
         blind = view.operated and not view.samples.scan_fresh(now)
         if (
@@ -260,10 +260,10 @@ class ContactCheck(Check):
 
 
 def _current_limit(rolling: Sequence[float], rise: float, step: float) -> float:
-    """Return the current limit (A): the rolling current plus the fraction ``rise`` of it, and plus its noise.
+    """Return the current limit (A): the rolling current, plus the fraction ``rise`` of it, plus its noise.
 
-    Downhill, the motor draws hardly any current, or brakes, so that the noise determines the limit. Readings of 0 hide
-    noise below half their resolution, ``step`` (A), so its rounding error counts as noise.
+    Downhill, the motor draws hardly any current, or brakes, so the noise determines the limit. Readings of 0 hide noise
+    below half their resolution ``step`` (A), so the rounding error is counted as noise.
     """
     usual, noise, sigmas = median(rolling), pstdev(rolling), 5.0  # significance
     if not usual:

@@ -1,11 +1,11 @@
 """The safety gate as a pure state machine: requests and observations in, actuator commands out at every tick.
 
 States: disarmed > armed > driving > stopping > (armed | disarmed); an emergency stop from any state latches.
-A stop is a single command, speed 0 or quick stop. The drive controller runs the ramp, so the stop completes even if
-nothing is sent afterwards. ``arbitration`` selects the driver and holds the transitions, ``sensors`` holds checks that
+A stop is a single command: speed 0 or quick stop. The drive controller runs the ramp, so the stop completes even if
+nothing more is sent. ``arbitration`` selects the driver and holds the transitions, ``sensors`` holds checks that
 stop or slow the truck, ``limiter`` converts requests to the commanded motion, ``stops`` reports the causes.
 
-Every stop ends with standstill confirmed by the drive. After a short fault (a late scan, an expired lease) the same
+Every stop ends when the drive confirms standstill. After a short fault (a late scan, an expired lease) the same
 source may continue; a fault longer than ``disarm_after``, or a reason in ``DISARMING``, disarms.
 """
 
@@ -99,7 +99,7 @@ def sensor_checks(view: GateView, *, battery_measured: bool, compared: bool = Fa
     Args:
         view: read access to the gate's state.
         battery_measured: whether a device measures the battery.
-        compared: whether the robot has to compare its measures of motion.
+        compared: whether the robot has to compare its measurements of motion.
     """
     config = view.config
     if config.runaway is not None:
@@ -125,7 +125,7 @@ def obstacle_checks(
     rear_sonars: Mapping[str, Place] | None,
     peers: Mapping[str, Footprint] | None,
 ) -> Iterator[Check]:
-    """Checks of the path ahead; arguments as for ``Gate``."""
+    """Checks of the path ahead; for the arguments see ``Gate``."""
     lidar = None if sonars else ObstacleCheck(view, points, rear_sonars)
     sonar = SonarCheck(view, sonars) if sonars else None
     yield from (check for check in (lidar, sonar) if check is not None)
@@ -136,7 +136,7 @@ def obstacle_checks(
 
 
 class Decision(NamedTuple):
-    """Decision of the gate about an order."""
+    """The gate's decision on an order."""
 
     reason: Reason
     """OK, or the reason for the refusal."""
@@ -196,15 +196,15 @@ class Gate:
         config: limits.
         chassis: kinematics of the body, its motors and servos.
         footprint: the truck's outline.
-        points: converts the scans of every lidar to points in base.
-        services: reason given by the loss of each sensor service, by service name.
+        points: converts the scans of every lidar to points in the base frame.
+        services: reason reported when a sensor service is lost, by service name.
         nonce: nonce of this run; requests must carry it.
         battery_measured: whether a device measures the battery.
         latched: whether the emergency stop was latched when the daemon last ran.
-        sonars: sonars of a robot without a lidar: pose (x, y, yaw) in base by name, m, m, rad.
-        rear_sonars: rear-facing sonars of a robot with a lidar, as ``sonars``.
+        sonars: sonars of a robot without a lidar: pose in the base frame (x and y in m, yaw in rad), by name.
+        rear_sonars: rear-facing sonars of a robot with a lidar, in the same form as ``sonars``.
         peers: outlines of other robots whose poses are received, by name.
-        compared: whether the robot has to compare its measures of motion.
+        compared: whether the robot has to compare its measurements of motion.
         zones: settings of the zones; None without zones.
         docks: docks by name.
         own: settings of checks added by the configuration, by name.
@@ -266,14 +266,14 @@ class Gate:
         """Whether the truck may have moved since the last measured standstill."""
 
     def configure(self, config: GateConfig) -> None:
-        """Replace the limits between two ticks; of the changed settings, only those marked live take effect at once.
+        """Replace the limits between two ticks; changed settings take effect immediately only if they are marked live.
 
-        A driving truck slows down to a lower limit by its ramp.
+        If a limit is lowered, a driving truck slows down along its ramp.
         """
         self._limits.config = config
 
     def _at_rest(self, now: int, since: int = 0) -> bool:
-        """Whether the truck is known to be at rest, by a sample not older than ``since`` (ns) and by every check."""
+        """Return whether every check, and a sample not older than ``since`` (ns), show that the truck is at rest."""
         return self._samples.at_rest(now, since) and not self._checks.moves
 
     @property
@@ -301,10 +301,10 @@ class Gate:
         return None if self._obstacles is None else self._obstacles.guard.memory.survey()
 
     def observe(self, message: Message, topic: Topic[Any]) -> None:
-        """Take the latest message of a topic; take every health table, because a later table may hide a restart.
+        """Process the latest message of a topic, and every health table, because a later table may hide a restart.
 
         Args:
-            message: message of a sensor or of other robots, a health table, or an event of any service.
+            message: message from a sensor or from other robots, a health table, or an event from any service.
             topic: topic of the message.
         """
         self._samples.observe(message, topic)
@@ -314,11 +314,11 @@ class Gate:
     # Requests
 
     def request(self, request: DriveRequest, now: int) -> Reason:
-        """Take an external drive request; return OK, or why it does not move the truck."""
+        """Process an external drive request; return OK, or why it does not move the truck."""
         return self._consider(request, now, self._sources.accept_request(request, now), inside=False)
 
     def planner_request(self, request: DriveRequest, now: int) -> Reason:
-        """Take a drive request of the robot's planners; return as ``request`` does."""
+        """Process a drive request from the robot's planners; return the same values as ``request``."""
         return self._consider(request, now, self._sources.accept_planner_request(request, now), inside=True)
 
     def _consider(self, request: DriveRequest, now: int, accepted: Reason, *, inside: bool) -> Reason:
@@ -346,7 +346,7 @@ class Gate:
         return next(iter(self._blocks(now)), Reason.OK)
 
     def _impossible(self, request: DriveRequest) -> str | None:
-        """Why the body cannot perform this motion; None if it can do it or a similar motion."""
+        """Return why the body cannot perform this motion; None if it can perform it or a similar motion."""
         forms = self._chassis.forms
         if request.form not in forms:
             return f"a request by {request.form}: this body accepts {' or '.join(sorted(forms))}"
@@ -357,13 +357,13 @@ class Gate:
         return None
 
     def control(self, request: ControlRequest, now: int) -> Decision:
-        """Carry out an order, or refuse it.
+        """Carry out or refuse an order.
 
         ESTOP and STOP are accepted from every source admitted by the bus, authenticated or not: stopping is always
-        safe. ARM and RESET need an operator's role, a truck at rest and no operator requesting motion. An authenticated
-        ESTOP or STOP consumes its sequence number, so the gate refuses an earlier order of the same source that arrives
-        later over another channel. The gate also refuses an ARM or RESET whose sender did not yet know of an ESTOP,
-        STOP or DISARM by another source.
+        safe. ARM and RESET require an operator's role, a truck at rest and no operator requesting motion. An
+        authenticated ESTOP or STOP consumes its sequence number, so the gate refuses an earlier order from the same
+        source that arrives later over another channel. The gate also refuses an ARM or RESET if its sender did not yet
+        know of an ESTOP, STOP or DISARM by another source.
         """
         reason, order = self._sources.accept_order(request, now), request.order
         if order is Order.ESTOP or order is Order.STOP:
@@ -405,7 +405,7 @@ class Gate:
         return Decision(self._refuse(now, reason, request, text), text)
 
     def _worded(self, reason: Reason) -> str:
-        """Wording of a refusal; a late request is reported as late, not as an expired lease."""
+        """Text of a refusal; a late request is reported as late, not as an expired lease."""
         return late_text(self._config.max_request_age) if reason is Reason.LEASE_EXPIRED else reason.text
 
     def _refuse_blocked(self, now: int, blocks: tuple[Reason, ...], request: ControlRequest) -> Decision:
@@ -541,7 +541,7 @@ class Gate:
         return self._output(now, blocks, limits)
 
     def _by_hand(self, holder: Source | None) -> bool:
-        """Whether an operator drives, as opposed to a calibration wizard."""
+        """Return whether an operator drives, rather than a calibration wizard."""
         if holder is None or holder.inside or self._states.calibrates:
             return False
         return holder.request.role in OPERATORS
@@ -561,20 +561,20 @@ class Gate:
         self._events.emit(now, Reason.UNCOMMANDED_MOTION, Severity.ERROR, text, values, always=True)
 
     def _confirm(self, now: int) -> None:
-        """Note that the truck moves or may move, until its standstill is measured."""
+        """Record that the truck moves or may move until its standstill is measured."""
         if self.mode.accepts_motion or self._checks.moves:
             self._unconfirmed = True
         elif self._at_rest(now, self._states.since):
             self._unconfirmed = False
 
     def _is_stopping(self, now: int) -> bool:
-        """Whether the truck must stand and its standstill has not been measured since."""
+        """Return whether the truck must stand and its standstill has not yet been measured."""
         if self.mode.accepts_motion:
             return self.mode is GateMode.ARMED and not self._at_rest(now)
         return self._unconfirmed
 
     def neutral(self, now: int) -> GateOutput:
-        """Return the last output before the daemon ends: quick stop; the gate does not drive after it."""
+        """Return the last output before the daemon ends: a quick stop. The gate does not drive afterwards."""
         self._shut_down = True
         self._motion.halt()
         if self._states.active:
@@ -584,7 +584,7 @@ class Gate:
         return self._output(now, (Reason.SHUTDOWN,), {})
 
     def _blocks(self, now: int) -> tuple[Reason, ...]:
-        """Why the truck may not move, worst first."""
+        """Reasons why the truck may not move, worst first."""
         return (*((Reason.SHUTDOWN,) if self._shut_down else ()), *self._checks.blocks(now))
 
     def _advance(self, now: int, blocks: tuple[Reason, ...]) -> None:
@@ -613,7 +613,7 @@ class Gate:
             self._disarm(now, f"no driver for {self._config.disarm_after:g} s")
 
     def _released(self, holder: Source, now: int) -> bool:
-        """Whether the holder's last request was standstill and the truck has been at rest since."""
+        """Return whether the holder last requested standstill and the truck has been at rest since."""
         return holder.neutral and self._motion.standing and self._at_rest(now, holder.arrived)
 
     def _stop(self, now: int, causes: list[Cause], *, ordered: bool = False) -> None:
@@ -709,5 +709,5 @@ class Gate:
 
 
 def _order_cause(reason: Reason, text: str, request: ControlRequest, now: int) -> Cause:
-    """Cause of a stop by an order."""
+    """Cause of a stop that was ordered."""
     return Cause(reason=reason, source=request.source, since=now, text=text)

@@ -1,18 +1,18 @@
 """Dock check: permits a slow approach to a dock while a behaviour docks or undocks.
 
-The gate knows the docks of the configuration: places, housings and staging distances. The behaviour reports the exact
-pose of a dock in ``plan/behaviour``; the gate accepts it only within these bounds:
+The gate knows the docks of the configuration: positions, housings and staging distances. The behaviour reports the
+exact pose of a dock in ``plan/behaviour``; the gate accepts the pose only within these bounds:
 
-- the behaviour runs, holds the drive, and its report is fresh;
-- the robot is localised on the map, and the dock is within 0.3 m and 0.3 rad of its place there;
-- the robot stands on the axis of the dock: at most ``docking.across`` to either side, ``docking.turn`` off it, not
-  further out than the staging pose, and no more than ``docking.beyond`` past the docked pose. A robot that docks in
-  reverse first faces the dock, and then backs off to turn around: either end may face the dock, up to ``turning``
-  beyond the staging pose.
+- the behaviour is running and has control, and its report is fresh;
+- the robot is localised on the map, and the dock is within 0.3 m and 0.3 rad of its pose there;
+- the robot is on the axis of the dock: at most ``docking.across`` to either side, at most ``docking.turn`` off in
+  heading, not further out than the staging pose, and no more than ``docking.beyond`` past the docked pose. A robot that
+  docks in reverse first faces the dock, and then backs off to turn around: either end may face the dock, up to
+  ``turning`` beyond the staging pose.
 
-Within them the pace is at most ``docking.speed``, lidar returns inside the housing are ignored, and the corridor of a
-robot within these bounds counts as seen ground. All other rules stay in force, and contact is detected as
-for an operator on unseen ground.
+Within these bounds the pace is at most ``docking.speed``, lidar returns inside the housing are ignored, and the
+corridor counts as seen ground. All other rules stay in force, and contact is detected as for an operator on unseen
+ground.
 """
 
 import math
@@ -58,7 +58,7 @@ class DockCheck(Check):
         self._slam: SlamHealth | None = None
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
-        """Take reports of behaviours and odometry; at a tick, find the area."""
+        """Process reports from behaviours and odometry; at a tick, find the area."""
         if isinstance(seen, Tick):
             self.view.dock = self._area(seen.now)
         elif isinstance(seen, BehaviourState):
@@ -107,7 +107,7 @@ class DockCheck(Check):
         return DockArea((at_x, at_y, yaw), (-far - limits.across - end, math.inf, side), housing)
 
     def _place(self, now: int) -> Array | None:
-        """Return base in map, shape (3,); None if the pose is old or unknown."""
+        """Return the base pose in the map, shape (3,); None if the pose is old or unknown."""
         located = self._located
         if located is None or now - located.received > POSE.fresh_for() * SECOND or placeless(self._slam):
             return None
@@ -122,7 +122,7 @@ class DockCheck(Check):
 
 
 def _agree(reported: Array, dock: DockConfig) -> bool:
-    """Return whether a reported dock, in map, agrees with its configured pose."""
+    """Return whether a reported dock pose in the map agrees with the configured pose."""
     x, y, turn = between(facing(np.array((dock.x, dock.y, dock.yaw)), dock), reported).tolist()
     off = 0.3  # m and rad: errors of the localisation and of the configured pose
     return math.hypot(x, y) <= off and abs(turn) <= off

@@ -23,7 +23,7 @@ from monstertruckd.gate.obstacles import OUTLINE, at_poses
 
 
 class FenceCheck(Check):
-    """Stops the robot before more of its outline leaves the fence; a robot outside may return.
+    """Stops the robot before more of its outline leaves the fence; a robot that is outside may return.
 
     Args:
         config: the fence.
@@ -41,12 +41,12 @@ class FenceCheck(Check):
         self._free: float | None = None
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
-        """Take the latest pose in map."""
+        """Process the latest pose in the map."""
         if isinstance(seen, Odometry) and topic is POSE:
             self._pose = seen
 
     def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
-        """Slow down towards the fence; stand without a fresh pose."""
+        """Slow down towards the fence; keep the robot at rest without a fresh pose."""
         if not courses:
             return
         age = math.inf if self._pose is None else (now - self._pose.stamp) / SECOND
@@ -63,7 +63,7 @@ class FenceCheck(Check):
             yield PaceLimit(Reason.OWN_CHECK, allowed if allowed >= config.obstacle.crawl else 0.0)
 
     def _distance(self, twist: UnitTwist, far: float) -> float:
-        """Distance along a motion before more of the outline is outside than now, m; +inf beyond ``far``."""
+        """Distance along a motion (m) until more of the outline is outside than now; +inf beyond ``far``."""
         assert self._pose is not None
         pose = self._pose.pose
         step = 0.02  # distance between the poses of a sweep, m
@@ -74,7 +74,7 @@ class FenceCheck(Check):
         return float(distances[further[0] - 1]) if len(further) else math.inf
 
     def text(self, reason: Reason) -> str:
-        """Fence ahead, or lack of a fresh pose."""
+        """Text for a fence ahead, or for the lack of a fresh pose."""
         return "the fence is ahead" if self._free is not None else "no fresh pose to check against the fence"
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:

@@ -1,8 +1,8 @@
-"""Checks that the body follows its commands: steering by the compass, driven shafts by their feedback.
+"""Checks that the body follows its commands: the compass checks the steering, feedback checks the driven shafts.
 
-``SteeringCheck`` finds servos without supply. Hobby servos report nothing, and a servo controller on USB power keeps
+``SteeringCheck`` detects servos without power. Hobby servos report nothing, and a servo controller on USB power keeps
 answering when the servos lose their separate supply. But then the compass heading departs from the heading computed
-from speed and commanded axle angles. ``ShaftCheck`` finds a blocked shaft.
+from speed and commanded axle angles. ``ShaftCheck`` detects a blocked shaft.
 """
 
 import math
@@ -21,7 +21,7 @@ from monstertruckd.gate.config import ShaftCheckConfig, SteeringCheckConfig
 
 
 class Comparison(Protocol):
-    """Compares commands with measurements; ``contradicts`` stays until ``reset``."""
+    """Compares commands with measurements; ``contradicts`` stays true until ``reset``."""
 
     @property
     def contradicts(self) -> bool:
@@ -35,7 +35,7 @@ C = TypeVar("C", bound=Comparison)
 
 
 class FollowingCheck(Check, Generic[C]):
-    """Gives one reason while a comparison contradicts.
+    """Reports one reason while a comparison shows a contradiction.
 
     Args:
         view: read access to the gate's state.
@@ -57,7 +57,7 @@ class FollowingCheck(Check, Generic[C]):
 
 
 class SteeringCheck(FollowingCheck["TurnComparison"]):
-    """Detects servos that do not follow their commands: the compass contradicts wheels and steering.
+    """Detects servos that do not follow their commands: the compass contradicts the wheels and the steering.
 
     Args:
         view: read access to the gate's state.
@@ -70,7 +70,7 @@ class SteeringCheck(FollowingCheck["TurnComparison"]):
         super().__init__(view, TurnComparison(config))
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
-        """Compare a heading with wheels and steering at the same time."""
+        """Compare a heading with the wheels and the steering at the same time."""
         if not isinstance(seen, Attitude):
             return
         now, samples = seen.received, self.view.samples
@@ -79,13 +79,13 @@ class SteeringCheck(FollowingCheck["TurnComparison"]):
         self._comparison.observe(seen.stamp, heading, samples.speed(now), samples.turn_rate(now))
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
-        """Difference between the turns."""
+        """Difference between the commanded and the measured turn."""
         turns = self._comparison
         yield Measurement(name="yaw difference", value=turns.difference, unit="rad", limit=turns.config.tolerance)
 
 
 class ShaftCheck(FollowingCheck["ShaftComparison"]):
-    """Detects a driven shaft that does not turn although commanded.
+    """Detects a driven shaft that does not turn when commanded.
 
     Args:
         view: read access to the gate's state.
@@ -110,7 +110,7 @@ class ShaftCheck(FollowingCheck["ShaftComparison"]):
 
 
 class TurnComparison:
-    """Compares commanded and measured turn over a sliding window; ``contradicts`` stays until ``reset``.
+    """Compares the commanded and the measured turn over a sliding window; ``contradicts`` stays true until ``reset``.
 
     Args:
         config: window and tolerance.
@@ -133,13 +133,13 @@ class TurnComparison:
         self.difference = 0.0
 
     def observe(self, stamp: int, heading: float | None, speed: float | None, rate: float) -> None:
-        """Take a heading, with the state of wheels and steering at the same time.
+        """Process a heading, together with the state of the wheels and the steering at that time.
 
         Args:
-            stamp: stamp of the measurement, ns.
-            heading: compass heading, clockwise, rad; None if the compass is disturbed.
-            speed: wheel speed over ground, m/s; None if unknown.
-            rate: yaw rate computed from wheel speeds and commanded steering angles, rad/s, left positive.
+            stamp: time stamp of the measurement (ns).
+            heading: compass heading, clockwise (rad); None if the compass is disturbed.
+            speed: wheel speed over ground (m/s); None if unknown.
+            rate: yaw rate computed from wheel speeds and commanded steering angles (rad/s), left positive.
         """
         if heading is None or speed is None or abs(speed) < self.config.speed:
             self._window.clear()
@@ -177,10 +177,10 @@ class TurnComparison:
 
 
 class ShaftComparison:
-    """Compares each driven shaft's speed with its command; ``blocked`` stays until ``reset``.
+    """Compares each driven shaft's speed with its command; ``blocked`` stays set until ``reset``.
 
-    A blocked shaft draws current up to the controller's limit and heats motor and clutch; the controller reports no
-    fault.
+    A blocked shaft draws current up to the controller's limit and heats the motor and the clutch; the controller
+    reports no fault.
 
     Args:
         config: time and tolerance.
@@ -206,13 +206,13 @@ class ShaftComparison:
         self.blocked = None
 
     def observe(self, feedback: DriveFeedback, shaft: int, commanded: float, measured: float) -> None:
-        """Take feedback of a shaft.
+        """Process feedback from a shaft.
 
         Args:
             feedback: feedback message.
             shaft: index of the shaft.
-            commanded: commanded wheel speed over ground, m/s.
-            measured: measured wheel speed over ground, m/s.
+            commanded: commanded wheel speed over ground (m/s).
+            measured: measured wheel speed over ground (m/s).
         """
         if feedback.current is not None:
             self._current[shaft] = feedback.current
@@ -232,5 +232,5 @@ class ShaftComparison:
 
     @property
     def current(self) -> float | None:
-        """Latest measured current of the blocked shaft, A."""
+        """Latest measured current of the blocked shaft (A)."""
         return None if self.blocked is None else self._current.get(self.blocked)

@@ -29,7 +29,7 @@ class FreshCheck(Check):
         self._received: int | None = None
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
-        """Note the arrival time of a message of the topic."""
+        """Record the arrival time of a message of the topic."""
         if isinstance(seen, Message) and topic is self._topic:
             self._received = seen.received
 
@@ -39,7 +39,7 @@ class FreshCheck(Check):
             yield Reason.OWN_CHECK
 
     def text(self, reason: Reason) -> str:
-        """Reason with the name of the topic."""
+        """Text of the reason, with the name of the topic."""
         return f"{self._topic.name} is silent"
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:

@@ -1,11 +1,11 @@
-"""Radio control of an operator next to the robot: the driving role with the highest priority.
+"""Radio control used by an operator next to the robot: the driving role with the highest priority.
 
 - The arm switch of the transmitter is a key: while it is off, the robot does not drive, even if another operator has
   armed it. Switching it from off to on is the order to arm.
-- While the arm switch and the drive switch (if fitted) are on, the sticks drive.
+- While the arm switch and the drive switch (if fitted) are on, the sticks drive the robot.
 - While the emergency stop switch is on, the robot stays emergency-stopped, even if another operator resets it.
 - Loss of the transmitter stops and disarms the robot, whichever source drives. After reconnection, the arm switch must
-  be off once before it can arm the robot.
+  be turned off once before it can arm the robot.
 """
 
 import secrets
@@ -30,7 +30,7 @@ MOBILE: Final = frozenset({GateMode.ARMED, GateMode.DRIVING})
 
 
 class HandConfig(Schema):
-    """Radio control of an operator next to the robot (`devices.hand`)."""
+    """Radio control used by an operator next to the robot (`devices.hand`)."""
 
     speed: Annotated[float, Field(gt=0, le=10)] = 0.2
     """Speed at full stick deflection, m/s"""
@@ -45,7 +45,7 @@ class HandConfig(Schema):
 
 
 class HandActions(NamedTuple):
-    """Actions derived from the radio control at one moment."""
+    """Actions derived from one reading of the radio control."""
 
     orders: tuple[Order, ...] = ()
     drives: bool = False
@@ -55,7 +55,7 @@ class HandActions(NamedTuple):
 
 
 class HandPolicy:
-    """Converts receiver messages to orders; pure, without input or output.
+    """Converts receiver messages to orders, without side effects.
 
     Args:
         config: limits.
@@ -71,9 +71,9 @@ class HandPolicy:
         """Return the actions for the latest receiver message.
 
         Args:
-            controls: latest message of the receiver, if any.
+            controls: latest message from the receiver, if any.
             mode: mode of the gate, if known.
-            now: time, ns.
+            now: current time (ns).
         """
         lost = self._lost(controls, now)
         if lost is not None or controls is None:
@@ -102,7 +102,7 @@ class HandPolicy:
         return None
 
     def _stop(self, mode: GateMode | None, now: int) -> tuple[Order, ...]:
-        """Orders that bring a mobile robot to rest, repeated until it is at rest."""
+        """Orders that bring a moving robot to rest; repeated until the robot is at rest."""
         repeat = SECOND // 5  # time between two orders to stop a robot that still moves, ns
         if mode not in MOBILE or (self._stopped_at is not None and now - self._stopped_at < repeat):
             return ()
@@ -111,7 +111,7 @@ class HandPolicy:
 
 
 class Inject(Protocol):
-    """Injects a request; ``Bus.inject``."""
+    """Injects a request; see ``Bus.inject``."""
 
     def __call__(self, topic: Topic[Any], message: Any) -> object:
         """See ``Bus.inject``."""
@@ -122,11 +122,11 @@ class HandService:
 
     Args:
         config: limits.
-        clock: time.
-        hand: latest message of the receiver.
+        clock: time source.
+        hand: latest message from the receiver.
         gate: latest state of the gate.
-        inject: sink of the requests.
-        events: sink of events: loss and return of the radio control.
+        inject: receives the requests.
+        events: receives events: loss and return of the radio control.
         steered: whether the body has steered axles; without them the steering stick turns the body.
     """
 

@@ -13,7 +13,7 @@ from monstertruckd.gate.motion import ROUNDING, Course, Target, scaled
 
 
 class Aim(NamedTuple):
-    """Motion requested at a tick, as far as the steering allows it so far."""
+    """Motion requested at a tick, as far as the steering permits it so far."""
 
     target: Target
     wanted: Twist2
@@ -29,10 +29,10 @@ class Aim(NamedTuple):
 
 
 class CommandLimiter(Check):
-    """Advances the commanded motion; as a check, gives the limits of body and configuration.
+    """Advances the commanded motion; as a check, it applies the limits of the body and the configuration.
 
     Args:
-        view: limits, samples and commanded motion, which it changes.
+        view: limits, samples and the commanded motion, which the limiter changes.
     """
 
     reasons = (Reason.SERVO_LIMIT, Reason.CLIPPED)
@@ -44,7 +44,7 @@ class CommandLimiter(Check):
     def aim(self, now: int, dt: float, request: DriveRequest | None) -> tuple[Course, ...] | None:
         """Steer for ``dt`` s towards the angles of ``request``; return the motions to be checked.
 
-        These are the requested and the commanded motion, unless they are at standstill; None without a request.
+        These are the requested and the commanded motion, except those at standstill; None without a request.
         """
         motion = self.view.motion
         if request is None:
@@ -95,7 +95,7 @@ class CommandLimiter(Check):
             motion.accelerate(scaled(aim.wanted, factor), dt)
 
     def stopping_distance(self, now: int) -> float:
-        """Distance travelled if stopped now, m, from the greater of measured and commanded speed."""
+        """Distance travelled if the truck stops now (m), from the greater of the measured and the commanded speed."""
         config = self.view.config
         speed = max(abs(self.view.samples.speed(now) or 0.0), *map(abs, self.view.motion.shaft_speeds))
         fastest = 1e6  # limit of measured speeds, m/s, so that their squares stay finite

@@ -1,8 +1,8 @@
-"""Commanded motion: converts requests of any form to a motion of the body, and ramps towards it.
+"""Commanded motion: converts requests of any form to a motion of the body, and ramps towards that motion.
 
 ``Motion.target`` converts every form of request to a twist of the base and the steering angles it needs; limits, ramps
 and the sweep are independent of the form. The size of a twist is its **pace**: the maximum speed of the base and of the
-driven wheels, m/s. For a truck that drives straight the pace is the speed of the base; for a body that turns on the
+driven wheels (m/s). For a truck that drives straight the pace is the speed of the base; for a body that turns on the
 spot it is the speed of the wheels.
 """
 
@@ -70,14 +70,14 @@ class Motion:
 
     @property
     def servos(self) -> Angles:
-        """Servo angles for the steering angles, rad."""
+        """Servo angles for the steering angles (rad)."""
         if self._servos[0] != self.angles:
             self._servos = self.angles, self._chassis.servos(*self.angles)
         return self._servos[1]
 
     @property
     def axle_angles(self) -> tuple[float, float]:
-        """Axle angles of the bicycle with the same motion, rad; 0 if there is none."""
+        """Axle angles of the bicycle model with the same motion (rad); 0 if there is none."""
         return self._chassis.axle_angles(self.twist, self.angles)
 
     @property
@@ -87,7 +87,7 @@ class Motion:
 
     @property
     def shaft_speeds(self) -> Speeds:
-        """Wheel speed over ground of every driven shaft, m/s."""
+        """Wheel speed over ground of every driven shaft (m/s)."""
         if self._open is not None:
             return self._open
         command = self.twist, self.angles
@@ -96,10 +96,10 @@ class Motion:
         return self._shafts[1]
 
     def target(self, request: DriveRequest) -> Target:
-        """Convert a request to a motion of this body, within the limit of the axle angles.
+        """Convert a request to a motion of this body, within the limit on the axle angles.
 
         Raises:
-            KinematicsError: the body cannot perform the motion; the message is the reason.
+            KinematicsError: the body cannot perform the motion; the message states the reason.
         """
         if request.shafts is not None:
             return self._target_of_shafts(request.shafts)
@@ -136,7 +136,7 @@ class Motion:
         return Target(self._chassis.predicted(shafts, *self.angles), self.angles, False, False, shafts)
 
     def _reached(self, angles: Angles) -> tuple[Angles, bool]:
-        """Steering angles within reach of the servos, and whether they differ from ``angles``."""
+        """Return steering angles within reach of the servos, and whether they differ from ``angles``."""
         reached = self._chassis.reached(angles)
         # Minimum reported difference between requested and reachable steering angle, rad.
         saturated = 1e-4
@@ -147,7 +147,7 @@ class Motion:
         return self._chassis.along(twist, *(self.angles if angles is None else angles))
 
     def pace(self, twist: Twist2, shafts: Speeds | None = None) -> float:
-        """Maximum speed of the base and of the driven wheels for a twist at the commanded steering angles, m/s.
+        """Maximum speed of the base and of the driven wheels for a twist at the commanded steering angles (m/s).
 
         Args:
             twist: twist of the base.
@@ -158,16 +158,16 @@ class Motion:
 
     @property
     def present_pace(self) -> float:
-        """Pace of the commanded motion, m/s."""
+        """Pace of the commanded motion (m/s)."""
         return self.pace(self.twist, self._open)
 
     def max_pace(self, twist: Twist2, shafts: Speeds | None = None) -> float:
-        """Maximum pace allowed in the direction of ``twist``, m/s; arguments as for ``pace``."""
+        """Maximum pace allowed in the direction of ``twist`` (m/s); for the arguments see ``pace``."""
         ahead = twist[0] >= AHEAD * self.pace(twist, shafts)
         return self._limits.config.speed if ahead else self._limits.config.reverse_speed
 
     def progress(self, measured: Speeds, twist: UnitTwist) -> float:
-        """Measured pace along a unit twist, m/s: a least-squares fit of its shaft speeds to the measured ones."""
+        """Measured pace along a unit twist (m/s), from a least-squares fit of its shaft speeds to the measured ones."""
         shafts = self._chassis.shafts_along(twist, *self.angles)
         return _dot(measured, shafts) / (_dot(shafts, shafts) or 1.0)
 
@@ -180,11 +180,11 @@ class Motion:
             self.twist = self.along(self.twist)
 
     def aligned(self, target: Angles) -> bool:
-        """Whether the body may move while its wheels turn to ``target``."""
+        """Return whether the body may move while its wheels turn to ``target``."""
         return self._chassis.aligned(self.angles, target)
 
     def reverses(self, target: Twist2, shafts: Speeds | None = None) -> bool:
-        """Whether ``target`` reverses the wheels of the commanded motion on the whole.
+        """Return whether ``target`` reverses most of the wheels' commanded motion.
 
         A change between open loop and the other forms is treated as a reversal: it passes through standstill.
         """
@@ -194,7 +194,7 @@ class Motion:
         return _dot(self.shaft_speeds, rolling) < 0
 
     def turn_shafts(self, target: Speeds, dt: float) -> None:
-        """Change the open-loop shaft speeds towards ``target`` (m/s), as ``accelerate`` changes the twist."""
+        """Change the open-loop shaft speeds towards ``target`` (m/s), in the way ``accelerate`` changes the twist."""
         now = self.shaft_speeds
         change = tuple(to - at for to, at in zip(target, now, strict=True))
         step = self.pace(self._forecast(change), change)
@@ -208,14 +208,14 @@ class Motion:
         self.twist = self._forecast(self._open)
 
     def slow_down(self, dt: float) -> None:
-        """Change the commanded motion towards standstill, whatever its form."""
+        """Ramp the commanded motion towards standstill, whatever its form."""
         if self._open is None:
             self.accelerate(STILL, dt)
         else:
             self.turn_shafts((0.0,) * len(self._open), dt)
 
     def _forecast(self, shafts: Speeds) -> Twist2:
-        """Predict the twist of the base at shaft speeds, even if they are inconsistent while they change."""
+        """Predict the twist of the base for shaft speeds, even if they are inconsistent while they change."""
         return self._chassis.twist(self._chassis.input_speeds(shafts, *self.angles), *self.angles)
 
     def accelerate(self, target: Twist2, dt: float) -> None:
@@ -237,7 +237,7 @@ class Motion:
         self.twist = target if share == 1.0 else (x, y, turn)
 
     def halt(self) -> None:
-        """Command standstill without a ramp: the drive controllers decelerate by their own profile."""
+        """Command standstill without a ramp: the drive controllers decelerate along their own profile."""
         self.twist = STILL
         self._open = None
 

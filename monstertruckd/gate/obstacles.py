@@ -61,11 +61,11 @@ def ground_ahead(body: Footprint, edges: Array, poses: Array) -> Array:
 
     Args:
         body: the footprint.
-        edges: points on the edges of the footprint, shape (k, 2), m.
-        poses: poses of base at equal steps of one twist, current pose first, shape (m, 3), m, m, rad.
+        edges: points on the edges of the footprint (m), shape (k, 2).
+        poses: poses of the base at equal steps of one twist (m, m, rad), current pose first, shape (m, 3).
 
     Returns:
-        Shape (m - 1, n, 2), m: the same points of the outline at all poses after the first.
+        The same points of the outline at all poses after the first (m), shape (m - 1, n, 2).
     """
     (step,) = at_poses(edges, poses[1:2])
     touch = 1e-6  # a point less deep than this inside the footprint is on its edge, m
@@ -73,7 +73,7 @@ def ground_ahead(body: Footprint, edges: Array, poses: Array) -> Array:
 
 
 def at_poses(points: Array, poses: Array) -> Array:
-    """Transform points (n, 2) of a body to every pose (m, 3); shape (m, n, 2)."""
+    """Transform the points (n, 2) of a body to every pose (m, 3); the result has shape (m, n, 2)."""
     c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     x, y = points.T
     return np.stack((poses[:, :1] + c * x - s * y, poses[:, 1:2] + s * x + c * y), axis=2)
@@ -98,8 +98,8 @@ class _LidarView:
     """View of one lidar.
 
     Args:
-        points: converts its scans to points in base.
-        visibility: when each sector around it was last seen.
+        points: converts the lidar's scans to points in the base frame.
+        visibility: when each sector around the lidar was last seen.
     """
 
     def __init__(self, points: ScanPoints, visibility: Visibility) -> None:
@@ -114,13 +114,13 @@ class ObstacleGuard:
     """Checks the swept footprint against the latest scan of every lidar.
 
     The truck may have moved since a scan was taken, so the stopping distance includes travel during the age of the
-    oldest one.
+    oldest scan.
 
     Args:
         limits: limits in force.
         footprint: the body's outline.
-        points: converts the scans of every lidar to points in base.
-        sonars: pose (x, y, yaw) of every sonar that looks backwards in base by name, m, m, rad.
+        points: converts the scans of every lidar to points in the base frame.
+        sonars: pose in the base frame (x and y in m, yaw in rad) of every sonar that looks backwards, by name.
     """
 
     def __init__(
@@ -154,7 +154,7 @@ class ObstacleGuard:
         self._follow_limits()
 
     def _follow_limits(self) -> None:
-        """Adopt the limits in force; if the range of kept points grows, forget the memory."""
+        """Adopt the limits in force; if the range of stored points grows, clear the memory."""
         config = self._limits.config
         if config is self._adopted:
             return
@@ -171,20 +171,20 @@ class ObstacleGuard:
 
     @property
     def reach(self) -> float:
-        """Length of the sweep, m."""
+        """Length of the sweep (m)."""
         return self._reach
 
     @property
     def stamp(self) -> int:
-        """Stamp of the latest scan, ns."""
+        """Stamp of the latest scan (ns)."""
         return self._stamp
 
     def points(self, within: float, *, reverse: bool) -> Array:
-        """Return measured and remembered points in base at the latest scan, shape (n, 2), m.
+        """Return measured and remembered points in the base frame at the latest scan (m), shape (n, 2).
 
         Args:
-            within: greatest distance from the base, m.
-            reverse: whether the points of the rear sonars belong to them.
+            within: maximum distance from the base (m).
+            reverse: whether to include points from the rear sonars.
         """
         seen = (self._measured, self.memory.points(), *((self.memory.echoes(),) if reverse else ()))
         points: Array = np.concatenate(seen)
@@ -192,11 +192,11 @@ class ObstacleGuard:
         return points[~on_body(self._footprint, points, -self._footprint.padding)]
 
     def looks_at(self, points: Array) -> NDArray[np.bool_]:
-        """Whether each point (n, 2) in base (m) lies in a lidar's field of view."""
+        """Return whether each point (m, base frame, shape (n, 2)) lies in a lidar's field of view."""
         return np.asarray(np.logical_or.reduce([eye.visibility.covers(points) for eye in self._eyes]))
 
     def move(self, now: int, twist: Twist2 | None, dt: float, doubt: float = 0.0) -> None:
-        """Move the body as ``ScanMemory.move`` does; a ``twist`` of None: the motion is unknown."""
+        """Move the body as ``ScanMemory.move`` does; if ``twist`` is None, the motion is unknown."""
         self._follow_limits()
         if twist is None:
             self.memory.forget()
@@ -213,7 +213,7 @@ class ObstacleGuard:
             self._checked = None
 
     def observe(self, scan: LaserScan, lidar: int = 0) -> None:
-        """Process a scan of a lidar, given by its number."""
+        """Process a scan from the lidar with number ``lidar``."""
         eye = self._eyes[lidar]
         points = eye.measured = eye.scan_points.of(scan)
         eye.visibility.observe(scan, points)
@@ -231,11 +231,11 @@ class ObstacleGuard:
         self._checked = None
 
     def free_distance(self, twists: tuple[UnitTwist, ...], dock: DockArea | None = None) -> float:
-        """Distance the footprint can travel from the pose of the scan, m; +inf if no obstacle is within reach.
+        """Distance the footprint can travel from the pose of the scan (m); +inf if no obstacle is within reach.
 
         Args:
-            twists: motions of the base; the shortest distance of all is returned.
-            dock: points inside its housing are ignored, and ground in its corridor is treated as seen.
+            twists: motions of the base; the shortest of their distances is returned.
+            dock: dock area: points inside its housing are ignored, and ground in its corridor is treated as seen.
         """
         self._follow_limits()
         if self._checked is None or (dock is None) != (self._dock is None):
@@ -254,7 +254,7 @@ class ObstacleGuard:
         return self._free
 
     def _update_unseen(self, twists: frozenset[_Steps]) -> None:
-        """Update ``unseen`` from the ground of travel in a field of view, each part by the lidar that sees it best."""
+        """Update ``unseen`` for ground travelled in a field of view; each part uses the lidar that sees it best."""
         sectors = np.concatenate([self._sweep(*twist).sectors for twist in twists], axis=1)
         ages = np.full(sectors.shape, np.nan)
         for row, of_eye, eye in zip(ages, sectors, self._eyes, strict=True):
@@ -266,7 +266,7 @@ class ObstacleGuard:
         self.unseen = oldest / SECOND if math.isfinite(oldest) else None
 
     def _swept(self, x: int, y: int, turn: int) -> _Sweep:
-        """Sweep a twist in steps of ``TWIST_STEP``; between two poses corners move no further than the base."""
+        """Sweep a twist in steps of ``TWIST_STEP``; between two poses, corners move no further than the base."""
         twist = (x * TWIST_STEP, y * TWIST_STEP, turn * TWIST_STEP)
         # Minimum number of poses along the swept path; more if a corner moves faster than the base.
         distances = np.linspace(0.0, self._reach, math.ceil(20 * max(self._footprint.corner_speed(twist), 1.0)))
@@ -292,11 +292,11 @@ class ObstacleGuard:
         return min(free, default=math.inf)
 
     def _check_ground(self, twists: frozenset[_Steps], measured: Array) -> None:
-        """Update ``known`` and ``known_slowly``, and shorten the free distance of turns on the spot.
+        """Update ``known`` and ``known_slowly``, and shorten the free distance for turns on the spot.
 
         Args:
             twists: motions of the base.
-            measured: measured points in base, shape (n, 2), m.
+            measured: measured points in the base frame (m), shape (n, 2).
         """
         self.known = self.known_slowly = math.inf
         # A turn on the spot must not cover unseen ground nearer than this to a measured point, m: an obstacle there is
@@ -329,9 +329,9 @@ class ObstacleGuard:
             self.known = min(self.known, known + self._further(twist, known))
 
     def _unknown(self, twist: _Steps, ground: Array) -> NDArray[np.bool_]:
-        """Whether each ground point (n, 2) along a motion is unseen by all scans, and not on the axis of a dock.
+        """Return whether each ground point (n, 2) along a motion is unseen by all scans and not on the axis of a dock.
 
-        In a motion ahead, sectors and points decide about ground in a lidar's field of view (``unseen``).
+        When moving ahead, sectors and points determine whether ground in a lidar's field of view is seen (``unseen``).
         """
         unknown = ~self.looks_at(ground) if _is_ahead(twist) else np.ones(len(ground), np.bool_)
         unknown[unknown] = ~self.memory.seen(ground[unknown])
@@ -340,7 +340,7 @@ class ObstacleGuard:
         return unknown
 
     def _further(self, twist: _Steps, known: float) -> float:
-        """Return the distance beyond ``known`` that stays on seen ground, m; less than the spacing of ground checks."""
+        """Return the distance beyond ``known`` on seen ground (m), which is less than the spacing of ground checks."""
         x, y, turn = (part * TWIST_STEP for part in twist)
         finer = 4  # parts of the distance between two ground checks; resolution of the edge of seen ground
         step = GROUND_STEP * float(self._sweep(*twist).distances[1]) / finer
@@ -350,22 +350,22 @@ class ObstacleGuard:
         return step * (finer - 1 if seen.all() else int(np.argmin(seen)))
 
     def allowed_before_unseen(self, now: int) -> float:
-        """Maximum pace that allows a comfortable stop on seen ground, m/s."""
+        """Maximum pace that allows a comfortable stop on seen ground (m/s)."""
         unsure = self.memory.unsure
         known = self.known if not unsure else min(self.known, self._reach) - unsure
         return comfortable_speed(known - DRIFT, self.delay(now), self._limits.config.obstacle.deceleration)
 
     def allowed_speed(self, free: float, now: int) -> float:
-        """Maximum pace that allows a comfortable stop within ``free`` metres, m/s."""
+        """Maximum pace that allows a comfortable stop within ``free`` metres (m/s)."""
         limits = self._limits.config.obstacle
         return comfortable_speed(free - limits.ahead, self.delay(now), limits.deceleration)
 
     def too_near(self, free: float, speed: float, now: int) -> bool:
-        """Whether an ordinary stop from the pace ``speed`` needs more than ``free`` metres."""
+        """Return whether an ordinary stop from the pace ``speed`` needs more than ``free`` metres."""
         return free < stopping(abs(speed), self.delay(now), self._limits.config.deceleration)
 
     def delay(self, now: int) -> float:
-        """Time from the latest view of the path to the reaction, s."""
+        """Time from the latest view of the path to the reaction (s)."""
         return (
             max(now - min(eye.stamp for eye in self._eyes), 0) / SECOND
             + (self.unseen or 0.0)
@@ -374,12 +374,12 @@ class ObstacleGuard:
 
 
 class ObstacleCheck(Check):
-    """Keeps the swept footprint clear of present and earlier lidar returns; gives no limit without fresh scans.
+    """Keeps the swept footprint clear of current and earlier lidar returns; gives no limit without fresh scans.
 
     Args:
         view: read access to the gate's state.
-        points: converts the scans of every lidar to points in base.
-        sonars: pose (x, y, yaw) of every sonar that looks backwards in base by name, m, m, rad.
+        points: converts the scans of every lidar to points in the base frame.
+        sonars: pose in the base frame (x and y in m, yaw in rad) of every sonar that looks backwards, by name.
     """
 
     reasons = (
@@ -407,7 +407,7 @@ class ObstacleCheck(Check):
         return self._approach.emergency
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
-        """Take valid scans, rounds of pings, and the motion of the body at every tick."""
+        """Process valid scans, rounds of pings, and the motion of the body at every tick."""
         view = self.view
         if isinstance(seen, Tick):
             # A disarmed robot may be pushed or carried; its memory stays valid while its wheels stand.
@@ -456,7 +456,7 @@ class ObstacleCheck(Check):
         self._approach.judge(now, twists, lambda speed: guard.too_near(free, speed, now))
 
     def _into_unseen(self, allowed: float, fastest: float) -> Iterator[PaceLimit]:
-        """Limits before unseen ground, which allows a pace of ``allowed``, for motions up to ``fastest`` (m/s)."""
+        """Limits before unseen ground, where the pace ``allowed`` is permitted, for motions up to ``fastest`` (m/s)."""
         config = self.view.config.obstacle
         if config.unseen == "slow" or self.view.calibrates:
             allowed = max(allowed, config.unseen_speed)
@@ -483,28 +483,28 @@ class ObstacleCheck(Check):
 
 
 def _on_the_spot(x: int, y: int) -> bool:
-    """Whether a motion, in steps of ``TWIST_STEP``, is a turn on the spot."""
+    """Return whether a motion, in steps of ``TWIST_STEP``, is a turn on the spot."""
     return math.hypot(x, y) * TWIST_STEP < AHEAD
 
 
 def _is_turn(twist: _Steps, body: Footprint) -> bool:
-    """Whether a motion is a turn on the spot, or about another point next to or under the body that is not ahead."""
+    """Return whether a motion turns on the spot, or about a point next to or under the body that is not ahead of it."""
     return _on_the_spot(*twist[:2]) or not (twist[0] < 0 or _is_ahead(twist) or _is_sideways(twist, body))
 
 
 def _near(points: Array, others: Array, within: float) -> NDArray[np.bool_]:
-    """Whether each point (n, 2) is nearer than ``within`` metres to any of ``others`` (m, 2)."""
+    """Return whether each point (n, 2) is nearer than ``within`` metres to any of ``others`` (m, 2)."""
     squares = (others**2).sum(axis=1) - 2 * points @ others.T
     return np.asarray((points**2).sum(axis=1) + squares.min(axis=1, initial=math.inf) < within**2)
 
 
 def _is_ahead(twist: _Steps) -> bool:
-    """Whether a motion is mostly ahead."""
+    """Return whether a motion leads mostly ahead."""
     return twist[0] * TWIST_STEP >= AHEAD
 
 
 def _is_sideways(twist: _Steps, body: Footprint) -> bool:
-    """Whether a whole side of the body moves outwards, and as fast as the body moves ahead.
+    """Return whether an entire side of the body moves outwards at least as fast as the body moves ahead.
 
     The centre of rotation then lies neither next to nor under the body.
     """

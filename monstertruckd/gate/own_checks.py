@@ -1,4 +1,4 @@
-"""Checks added by a configuration: their faults stop the robot and never end the gate."""
+"""Checks added by a configuration: a fault in one of them stops the robot and never ends the gate."""
 
 import logging
 from collections.abc import Callable, Iterable, Sequence
@@ -18,7 +18,7 @@ T = TypeVar("T")
 
 
 class OwnCheck(Check):
-    """A check by ``kind``; once it raises, it is disabled and the robot stands until the daemon is restarted.
+    """A check selected by ``kind``; if it raises, it is disabled and the robot stands until the daemon is restarted.
 
     Args:
         view: read access to the gate's state.
@@ -26,7 +26,7 @@ class OwnCheck(Check):
         config: settings of the check.
 
     Raises:
-        InputError: the implementation does not load.
+        InputError: the implementation cannot be loaded.
     """
 
     def __init__(self, view: GateView, name: str, config: CheckConfig) -> None:

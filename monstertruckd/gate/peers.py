@@ -2,9 +2,10 @@
 
 A lidar does not look behind the robot, and its earlier view of that ground is old: another robot may have arrived
 since. The outlines of the robots in section ``peers`` are obstacles outside the lidar's field of view, or all around a
-robot without a lidar. Each outline is predicted from the latest pose and twist to now and over the next second. The
-clearance grows with the standard deviation of both poses. An outline whose latest pose is older than ``FRESH`` stays in
-place for 30 s. Such a robot may be anywhere (``unknown``), as may a robot whose pose is less certain than ``UNSURE``.
+robot without a lidar. Each outline is predicted from the latest pose and twist up to now and over the next second. The
+clearance grows with the standard deviations of both poses. An outline whose latest pose is older than ``FRESH`` stays
+in place for 30 s. Such a robot may be anywhere (``unknown``), as may a robot whose pose is less certain than
+``UNSURE``.
 """
 
 import math
@@ -57,11 +58,11 @@ class PeerGuard:
         self._heard: dict[str, Peer] = {}
 
     def observe_pose(self, pose: Odometry) -> None:
-        """Take the latest pose of this robot in the map."""
+        """Process the latest pose of this robot in the map."""
         self._own = pose
 
     def observe(self, peers: Peers) -> None:
-        """Take the latest poses of the other robots."""
+        """Process the latest poses of the other robots."""
         self._heard = {peer.robot: peer for peer in peers.peers if peer.robot in self._edges}
 
     def unknown(self, now: int) -> bool:
@@ -74,12 +75,12 @@ class PeerGuard:
         )
 
     def free_distance(self, twists: Iterable[UnitTwist], reach: float, now: int, seen: Seen | None) -> float:
-        """Distance the footprint can travel, m; +inf if no other robot is known to be within reach.
+        """Distance the footprint can travel (m); +inf if no other robot is known to be within reach.
 
         Args:
-            twists: motions of the base; the shortest distance of all is returned.
-            reach: distance swept, m.
-            now: ns.
+            twists: motions of the base; the shortest of their distances is returned.
+            reach: distance swept (m).
+            now: current time (ns).
             seen: lidar's field of view, where the scan covers the outlines; None without a lidar.
         """
         free = math.inf
@@ -100,11 +101,11 @@ class PeerGuard:
         return free
 
     def _fresh(self, now: int) -> Odometry | None:
-        """Pose of this robot; None if too old."""
+        """Pose of this robot; None if it is too old."""
         return None if self._own is None or _age(self._own.stamp, now) > FRESH else self._own
 
     def _outline(self, peer: Peer, own: Place, now: int, reach: float, clearance: float) -> Array:
-        """Current and predicted outlines of another robot in base, shape (n, 2), m; empty if it is far away."""
+        """Current and predicted outlines of another robot in the base frame (m), shape (n, 2); empty if far away."""
         edges, age = self._edges[peer.robot], _age(peer.heard, now)
         pose, twist = peer.pose, peer.twist
         horizon = (0.0, 0.5, 1.0)  # prediction times for the motion of another robot, s
@@ -127,7 +128,7 @@ class PeerGuard:
 
 
 class PeerCheck(Check):
-    """Keeps the swept footprint clear of other robots; in a lidar's field of view its scan covers them.
+    """Keeps the swept footprint clear of other robots; in a lidar's field of view, the lidar's scan covers them.
 
     Args:
         view: read access to the gate's state.
@@ -158,7 +159,7 @@ class PeerCheck(Check):
         return self._approach.emergency
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
-        """Take the pose of this robot in the map, the common frame of all poses, and the poses of the other robots."""
+        """Process this robot's pose in the map, the common frame of all poses, and the poses of the other robots."""
         if isinstance(seen, Odometry) and topic is POSE:
             self._guard.observe_pose(seen)
         elif isinstance(seen, Peers):
@@ -197,22 +198,22 @@ class PeerCheck(Check):
 
 
 def _age(stamp: int, now: int) -> float:
-    """Age of a stamp, s; 0 for a stamp in the future."""
+    """Age of a stamp (s); 0 for a stamp in the future."""
     return max(now - stamp, 0) / SECOND
 
 
 def _deviation(own: Odometry, peer: Peer) -> float:
-    """Standard deviation of the relative position, m; the errors of both poses are independent."""
+    """Standard deviation of the relative position (m), assuming independent errors of the two poses."""
     return math.hypot(own.position_deviation, peer.deviation)
 
 
 def _moved(pose: Pose2D, twist: Twist2D, seconds: float) -> Place:
-    """Pose after ``seconds`` (s) of a constant twist, m, m, rad."""
+    """Pose after ``seconds`` (s) of a constant twist (m, m, rad)."""
     return integrate((pose.x, pose.y, pose.yaw), twist.vx, twist.vy, twist.wz, seconds)
 
 
 def _edges(body: Footprint) -> Array:
-    """Points along the outline of a body, in its base, shape (n, 2), m."""
+    """Points along the outline of a body in its base frame (m), shape (n, 2)."""
     spacing = 0.03  # distance between the points of an outline, m
     along, across = (math.ceil(2 * half / spacing) + 1 for half in (body.half_length, body.half_width))
     return body.edge_points(along, across)

@@ -1,4 +1,4 @@
-"""Rear-facing sonars of a robot with a lidar: view of the ground behind it.
+"""Rear-facing sonars of a robot with a lidar: they observe the ground behind it.
 
 An echo shows that the ground within the cone is free up to the measured range, and that an obstacle stands on the arc
 at that range. A ping without an echo carries no information, because a surface may have reflected the sound elsewhere.
@@ -19,7 +19,7 @@ from monstertruckd.gate.sonars import ALIGNED, Place, arc, is_late
 
 
 class MountedEcho(NamedTuple):
-    """Answer of one sonar."""
+    """Echo measured by one sonar."""
 
     sonar: str
     mount: Place
@@ -31,18 +31,18 @@ class MountedEcho(NamedTuple):
 
 
 def rear(mounts: Mapping[str, Place]) -> dict[str, Place]:
-    """Sonars of ``mounts`` (pose in base by name: m, m, rad) that look backwards."""
+    """Return the sonars of ``mounts`` (pose in the base frame by name; m, m, rad) that look backwards."""
     return {
         name: place for name, place in mounts.items() if abs(math.remainder(place[2] - math.pi, math.tau)) <= ALIGNED
     }
 
 
 class RearSonars:
-    """Splits rounds of pings and notes which sonars are silent.
+    """Splits rounds of pings by sonar and records which sonars are silent.
 
     Args:
         limits: limits in force.
-        mounts: pose (x, y, yaw) of every sonar that looks backwards in base by name, m, m, rad.
+        mounts: pose in the base frame (x and y in m, yaw in rad) of every sonar that looks backwards, by name.
     """
 
     def __init__(self, limits: InForce, mounts: Mapping[str, Place]) -> None:
@@ -52,7 +52,7 @@ class RearSonars:
         """Time of the last answer of every sonar that is not silent, ns."""
 
     def pings(self, ranges: SonarRanges) -> Iterator[MountedEcho]:
-        """Answers in a round of pings; none if the round is late."""
+        """Echoes in a round of pings; none if the round is late."""
         if is_late(ranges, self._limits.config):
             return
         for echo in ranges.sonars:

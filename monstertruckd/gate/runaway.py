@@ -2,12 +2,12 @@
 
 A shaft may turn no faster than the fastest order in force. A superseded order stays in force until feedback arrives
 later than the reaction time after the new order: a drive that does not answer may not have received the new order
-either. If the shaft turns faster than its orders, the bound falls at the minimum deceleration of the drive's own ramp.
-``ShaftBounds`` holds both bounds, forward and backward. The criterion is the distance that a shaft turns beyond its
-bounds: a short overshoot moves nothing, a lasting slow creep does.
+either. If the shaft turns faster than its orders allow, the bound falls at the minimum deceleration of the drive's own
+ramp. ``ShaftBounds`` holds the forward and the backward bound. The criterion is the distance that a shaft turns beyond
+its bounds: a short overshoot moves nothing, but a lasting slow creep does.
 
 Only motion caused by a motor is judged. A power stage that is off and draws no current turns nothing: the robot is
-pushed, or it rolls. If a drive does not measure its current, all its motion is judged.
+being pushed, or it rolls. If a drive does not measure its current, all its motion is judged.
 """
 
 import math
@@ -36,7 +36,7 @@ LEAK: Final = 0.1
 
 
 class RunawayKind(StrEnum):
-    """How a motion departs from the orders; the value is the wording for messages."""
+    """How a motion departs from the orders; the value is the text for messages."""
 
     NO_ORDER = "turns without a command"
     DOES_NOT_STOP = "does not stop"
@@ -62,14 +62,14 @@ class Runaway(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Wording for messages."""
+        """Text for messages."""
         if self.kind is RunawayKind.STRAYS:
             return f"{self.source} {self.kind}"
         return f"{self.source} {self.kind} at {self.measured:.3f} m/s"
 
 
 class _Order(NamedTuple):
-    """Speed ordered from ``since`` (ns) on, or the bounds of several merged orders, m/s."""
+    """Speed ordered since ``since`` (ns), or the bounds of several merged orders (m/s)."""
 
     since: int
     low: float
@@ -77,7 +77,7 @@ class _Order(NamedTuple):
 
 
 class _Beyond(NamedTuple):
-    """Accumulated distance beyond the allowed one, m."""
+    """Accumulated distance beyond the allowed distance (m)."""
 
     velocity: float = 0.0
     """Integrated from the velocity."""
@@ -90,7 +90,7 @@ class _Beyond(NamedTuple):
 
 
 class ShaftBounds:
-    """Speeds allowed by the orders of a shaft, forward positive, m/s; ``low`` <= 0 <= ``high``."""
+    """Speeds allowed by the orders to a shaft (m/s, forward positive); ``low`` <= 0 <= ``high``."""
 
     def __init__(self) -> None:
         self.low = 0.0
@@ -103,7 +103,7 @@ class ShaftBounds:
 
     @property
     def ordered(self) -> float:
-        """Latest order, m/s."""
+        """Latest order (m/s)."""
         newest = self._orders[-1]
         return newest.high if newest.high > 0.0 else newest.low
 
@@ -126,10 +126,10 @@ class ShaftBounds:
         """Update the bounds from one measurement to the next.
 
         Args:
-            before: stamp of the previous measurement, ns.
-            stamp: stamp of this measurement, ns.
-            reaction: time from an order to its effect, s.
-            deceleration: minimum deceleration of the drive's ramps, m/s^2.
+            before: stamp of the previous measurement (ns).
+            stamp: stamp of this measurement (ns).
+            reaction: time from an order to its effect (s).
+            deceleration: minimum deceleration of the drive's ramps (m/s^2).
         """
         heard = before - round(reaction * SECOND)
         while len(self._orders) > 1 and self._orders[1].since <= heard:
@@ -183,15 +183,15 @@ class ShaftWatch:
         deceleration: float,
         standstill: float,
     ) -> Runaway | None:
-        """Take feedback; return an uncommanded motion, once.
+        """Process feedback; return an uncommanded motion, once.
 
         Args:
-            feedback: feedback of the shaft.
-            metres: distance over ground per radian of the motor, m.
+            feedback: feedback from the shaft.
+            metres: distance over ground per radian of the motor (m).
             config: limits.
-            reaction: time from an order to its effect, s.
-            deceleration: minimum deceleration of the drive's ramps, m/s^2.
-            standstill: speed below which a shaft is at rest, m/s.
+            reaction: time from an order to its effect (s).
+            deceleration: minimum deceleration of the drive's ramps (m/s^2).
+            standstill: speed below which a shaft is at rest (m/s).
         """
         before, self._before = self._before, feedback
         velocity = feedback.velocity * metres
@@ -219,7 +219,7 @@ class ShaftWatch:
         return self._judge(velocity, before.velocity * metres, step, dt, config.distance, standstill)
 
     def pulls(self, config: RunawayConfig, *, fresh: bool) -> bool:
-        """Whether the motor may be moving the body, even if the shaft reads standstill.
+        """Return whether the motor may be moving the body, even if the shaft reads standstill.
 
         Args:
             config: limits.
@@ -243,7 +243,7 @@ class ShaftWatch:
             self.measures_current, self._current = True, feedback.current
 
     def _is_driven(self, feedback: DriveFeedback, config: RunawayConfig) -> bool:
-        """Whether the motor may turn the shaft; a current not yet measured in this mode does not show it."""
+        """Return whether the motor may be turning the shaft; a current not yet measured in this mode shows nothing."""
         if feedback.mode in POWERED or not self.measures_current:
             return True
         return self._current is not None and abs(self._current) > config.idle_current
@@ -294,7 +294,7 @@ class BodyWatch:
 
     Args:
         source: role of the sensor.
-        fresh_for: age above which its latest sample is ignored, s.
+        fresh_for: age above which its latest sample is ignored (s).
     """
 
     def __init__(self, source: str, fresh_for: float) -> None:
@@ -308,14 +308,14 @@ class BodyWatch:
     def observe(
         self, stamp: int, speed: float, config: RunawayConfig, standstill: float, *, standing: bool, driven: bool
     ) -> Runaway | None:
-        """Take a speed; return an uncommanded motion, once.
+        """Process a speed; return an uncommanded motion, once.
 
         Args:
-            stamp: stamp of the sample, ns.
-            speed: speed of the body or of a free wheel, m/s.
+            stamp: time stamp of the sample (ns).
+            speed: speed of the body or of a free wheel (m/s).
             config: limits.
-            standstill: speed below which the robot is at rest, m/s.
-            standing: whether all drives are ordered to stand and have had the time to obey.
+            standstill: speed below which the robot is at rest (m/s).
+            standing: whether all drives are ordered to stand and have had time to obey.
             driven: whether a motor may be moving the robot.
         """
         before, self._stamp = self._stamp, stamp
@@ -333,18 +333,18 @@ class BodyWatch:
     def observe_window(
         self, since: int, stamp: int, moved: float, config: RunawayConfig, *, stood: int, now: int, driven: bool
     ) -> Runaway | None:
-        """Take proven motion in a time window; return an uncommanded motion.
+        """Process proven motion in a time window; return an uncommanded motion.
 
         Distance accumulates over consecutive windows. A window that is published again is ignored, and so is one that
-        starts before the robot stands: it shows braking.
+        starts before the robot stands, because it shows braking.
 
         Args:
-            since: start of the window, ns.
-            stamp: end of the window, ns.
-            moved: distance travelled by the body, m.
+            since: start of the window (ns).
+            stamp: end of the window (ns).
+            moved: distance travelled by the body (m).
             config: limits.
-            stood: time since when the robot must stand, ns.
-            now: end of the extrapolation of the motion, ns.
+            stood: time from which the robot must stand (ns).
+            now: end of the extrapolation of the motion (ns).
             driven: whether a motor may be moving the robot.
         """
         if stamp == self._stamp:
@@ -362,13 +362,13 @@ class BodyWatch:
         return Runaway(RunawayKind.BODY_MOVES, self._source, speed, 0.0, 0.0)
 
     def expire(self, now: int) -> None:
-        """Ignore the motion of a sample that is too old at ``now``, ns."""
+        """Ignore the motion of a sample that is too old at ``now`` (ns)."""
         if self._stamp is not None and now - self._stamp > self._fresh_for:
             self.runs = False
 
 
 class Escalation(IntEnum):
-    """Steps against a runaway; each follows when the previous one has not helped."""
+    """Steps against a runaway; each step follows if the previous one has not helped."""
 
     NONE = 0
     QUICK_STOP = 1
@@ -382,8 +382,8 @@ class Escalation(IntEnum):
 class RunawayCheck(Check):
     """Detects uncommanded motion of a motor in any mode; the finding stays until an operator resets the emergency stop.
 
-    Every finding triggers the next step. The bounds then restart at the measured speed, and a step that works keeps the
-    shaft within them.
+    Every finding triggers the next step. The bounds then restart at the measured speed; if the step works, the shaft
+    stays within them.
 
     Args:
         view: read access to the gate's state.
@@ -419,7 +419,7 @@ class RunawayCheck(Check):
     # Inputs
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
-        """Take the command of a tick, or a measurement of motion."""
+        """Process the command of a tick, or a measurement of motion."""
         match seen:
             case Tick():
                 self._command(seen.now)
@@ -465,16 +465,16 @@ class RunawayCheck(Check):
 
     @property
     def _obeyed(self) -> int:
-        """Time by when every drive must have obeyed the latest order to stand, ns."""
+        """Time by which every drive must have obeyed the latest order to stand (ns)."""
         limits = self.view.config
         return self._commanded + round((limits.reaction + limits.speed / limits.deceleration) * SECOND)
 
     @property
     def _stood(self) -> int:
-        """Time since when motion of the body is judged, ns.
+        """Time from which motion of the body is judged (ns).
 
-        Judging starts when all drives read standstill. Drives without a measured current get the full time to obey:
-        scans with late stamps may still show their braking.
+        Judging starts when all drives read standstill. Drives without a measured current get the full time to obey,
+        because scans with late stamps may still show their braking.
         """
         still = [watch.still_since for watch in self._shafts if watch.measures_current]
         known = [since for since in still if since is not None]
@@ -488,7 +488,7 @@ class RunawayCheck(Check):
         self._take(found, now)
 
     def _take_unshown(self, motion: UnshownMotion, now: int) -> None:
-        """Judge proven motion of the body from the time on since which a motor could cause it."""
+        """Judge proven motion of the body from the earliest time at which a motor could have caused it."""
         driven, powered = self._pulled(now), min(watch.powered_since for watch in self._shafts)
         if motion.stamp <= powered:
             self._unjudged = None
@@ -510,7 +510,7 @@ class RunawayCheck(Check):
         self._take(found, now)
 
     def _take_joints(self, seen: StabiliserFeedback) -> None:
-        """Detect joints that stray: they already have no torque, so the drives need only the stop."""
+        """Detect joints that move uncommanded: they already have no torque, so only the drives need to stop."""
         before, self._strays = self._strays, seen.pitch_joint.strays + seen.roll_joint.strays
         if self._strays > before:
             self._found = Runaway(RunawayKind.STRAYS, DeviceRole.STABILISER.value, 0.0, 0.0, 0.0)
@@ -518,7 +518,7 @@ class RunawayCheck(Check):
             self._step = max(self._step, Escalation.QUICK_STOP)
 
     def _pulled(self, now: int) -> bool:
-        """Whether a motor may be moving the body; a body that falls over or slides down is moved by its weight."""
+        """Return whether a motor may be moving the body; a body that falls or slides is moved by its weight."""
         samples = self.view.samples
         if samples.tips(now):
             return False
@@ -559,12 +559,12 @@ class RunawayCheck(Check):
 
     @property
     def power_off(self) -> bool:
-        """Whether quick stops have not helped."""
+        """Whether quick stops have failed to stop the motion."""
         return self._step >= Escalation.POWER_OFF
 
     @property
     def port_off(self) -> bool:
-        """Whether switching the power stages off has not helped either."""
+        """Whether switching off the power stages has also failed."""
         return self._step >= Escalation.PORT_OFF
 
     def text(self, reason: Reason) -> str:

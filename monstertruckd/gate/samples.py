@@ -155,7 +155,7 @@ class Samples:
                 self._speed = None
 
     def _loss(self, stale: Reason, lidar: DeviceRole | None) -> int | None:
-        """Latest loss of a sensor behind ``stale``, of several lidars of this one, ns."""
+        """Latest loss of a sensor behind ``stale``, of several lidars of this one (ns)."""
         services = [name for name, reason in self._services.items() if reason is stale and lidar in (None, name)]
         return max((self._lost[name] for name in services if name in self._lost), default=None)
 
@@ -180,7 +180,7 @@ class Samples:
         stale: Reason,
         lidar: DeviceRole | None = None,
     ) -> bool:
-        """Whether a sample is fresh; False for a sensor that the robot does not have (no limit)."""
+        """Return whether a sample is fresh; False for a sensor that the robot does not have (no limit)."""
         if limit is None or message is None:
             return False
         lost = self._loss(stale, lidar)
@@ -189,21 +189,21 @@ class Samples:
         return now - message.received <= limit.stale_after * SECOND
 
     def scan_fresh(self, now: int) -> bool:
-        """Whether the scans of all lidars are fresh."""
+        """Return whether the scans of all lidars are fresh."""
         limit = self._limits.config.scan
         rows = zip(self._lidars, self.scans, strict=True)
         return all(self._fresh(scan, limit, now, Reason.SCAN_STALE, lidar) for lidar, scan in rows)
 
     def steering_fresh(self, now: int) -> bool:
-        """Whether the steering feedback is fresh."""
+        """Return whether the steering feedback is fresh."""
         return self._fresh(self.steering, self._limits.config.steering, now, Reason.STEERING_STALE)
 
     def attitude_fresh(self, now: int) -> bool:
-        """Whether the attitude is fresh."""
+        """Return whether the attitude is fresh."""
         return self._fresh(self.attitude, self._limits.config.attitude, now, Reason.ATTITUDE_STALE)
 
     def tips(self, now: int) -> bool:
-        """Whether the robot falls over or slides down at ``now`` (ns), by the last measured tilt.
+        """Return whether the robot falls over or slides down at ``now`` (ns), by the last measured tilt.
 
         While it falls, its acceleration hides the tilt from the sensor.
         """
@@ -211,7 +211,7 @@ class Samples:
         return (shaken or self.attitude_fresh(now)) and self.tilt >= self._limits.config.tilt.stop
 
     def battery_fresh(self, now: int) -> bool:
-        """Whether the battery voltage is fresh."""
+        """Return whether the battery voltage is fresh."""
         return self._fresh(self.battery, self._limits.config.battery, now, Reason.BATTERY_STALE)
 
     @property
@@ -220,7 +220,7 @@ class Samples:
         return [drive for drive in self.drives if drive is not None and drive.mode is DriveMode.FAULT]
 
     def values(self, now: int) -> dict[str, Value]:
-        """Measurements for events at ``now``, ns."""
+        """Measurements for events at ``now`` (ns)."""
         values: dict[str, Value] = {}
         if faults := self.faults:
             values["drive_fault_code"] = faults[-1].fault_code
@@ -231,28 +231,28 @@ class Samples:
         return values
 
     def speed(self, now: int) -> float | None:
-        """Measured speed of the fastest wheel over ground, m/s; None without fresh feedback of every shaft."""
+        """Measured speed of the fastest wheel over ground (m/s); None without fresh feedback from every shaft."""
         if self._speed is None or self._speed[0] != now:
             rolling = self.shaft_speeds(now)
             self._speed = now, self._chassis.fastest_wheel_speed(rolling) if rolling else None
         return self._speed[1]
 
     def shaft_speeds(self, now: int) -> Speeds:
-        """Measured wheel speed over ground of every driven shaft, m/s; empty without fresh feedback of all of them."""
+        """Measured wheel speed over ground of every driven shaft (m/s); empty unless all shafts have fresh feedback."""
         return tuple([self._chassis.drivetrain.speed(drive.velocity) for drive in self._fresh_drives(now)])
 
     def twist(self, now: int) -> Twist2 | None:
-        """Velocity of the base by measured shaft speeds and latest steering angles; None without fresh shaft speeds."""
+        """Velocity of the base, from measured shaft speeds and the latest steering angles; None if not fresh."""
         rolling, angles = self.shaft_speeds(now), self.angles
         return self._chassis.twist(self._chassis.input_speeds(rolling, *angles), *angles) if rolling else None
 
     def turn_rate(self, now: int) -> float:
-        """Yaw rate of ``twist``, rad/s; 0 if the twist is unknown."""
+        """Yaw rate of ``twist`` (rad/s); 0 if the twist is unknown."""
         twist = self.twist(now)
         return 0.0 if twist is None else twist[2]
 
     def _fresh_drives(self, now: int) -> list[DriveFeedback]:
-        """Feedback of all shafts; empty unless all are fresh."""
+        """Feedback from all shafts; empty unless all of it is fresh."""
         limit = self._limits.config.drive
         drives = [d for d in self.drives if d is not None and self._fresh(d, limit, now, Reason.DRIVE_STALE)]
         return drives if len(drives) == len(self.drives) else []
@@ -270,7 +270,7 @@ class Samples:
         return {reason: limit for reason, limit in limits.items() if limit is not None}
 
     def fresh(self, now: int) -> dict[Reason, bool]:
-        """Whether each sensor is fresh, by its staleness reason."""
+        """Return whether each sensor is fresh, by its staleness reason."""
         return {
             Reason.DRIVE_STALE: bool(self._fresh_drives(now)),
             Reason.STEERING_STALE: self.steering_fresh(now),
@@ -280,7 +280,7 @@ class Samples:
         }
 
     def at_rest(self, now: int, since: int = 0) -> bool:
-        """Whether the truck is known to be at rest, by a sample not older than ``since``, ns.
+        """Return whether a sample not older than ``since`` (ns) shows that the truck is at rest.
 
         A truck without a critical drive counts as at rest.
         """
@@ -291,7 +291,7 @@ class Samples:
         return sampled >= since and abs(speed) < self._limits.config.standstill
 
     def staleness(self, stale: Reason, now: int) -> Staleness:
-        """Details of the stale sensor behind ``stale``; with several lidars or shafts, of the oldest stale sample."""
+        """Details of the stale sensor behind ``stale``; among several lidars or shafts, of the oldest stale sample."""
         limit, rows = self.sensor_limits()[stale], self._samples(stale)
         late = [row for row in rows if not self._fresh(row.sample, limit, now, stale, row.lidar)] or rows
         lidar, topic, sample = min(late, key=lambda row: -1 if row.sample is None else row.sample.received)

@@ -52,11 +52,11 @@ class Beams(NamedTuple):
 
     @classmethod
     def across(cls, stamp: int, cone: float, free: float) -> Self:
-        """Free distance ``free`` (m) across the ``cone`` (rad) of a sonar, as of two beams."""
+        """Create beams with the free distance ``free`` (m) across a sonar's ``cone`` (rad), as if from two beams."""
         return cls(stamp, -cone / 4, cone / 2, np.full(2, free), np.zeros(2, np.bool_))
 
     def inside(self, margin: float) -> NDArray[np.bool_]:
-        """Whether each beam lies further than ``margin`` (rad) from the edges of the field of view, shape (n,)."""
+        """Return whether each beam is further than ``margin`` (rad) from the edges of the field of view, shape (n,)."""
         count, wide = len(self.hidden), math.ceil(margin / abs(self.step))
         if is_full_turn(count, self.step):
             outside = np.pad(self.hidden, wide, "wrap")
@@ -67,7 +67,7 @@ class Beams(NamedTuple):
 
 
 class _Taken(NamedTuple):
-    """A scan or ping, with the pose where it was taken."""
+    """A scan or ping, with the pose at which it was taken."""
 
     beams: Beams
     pose: Pose2
@@ -89,14 +89,14 @@ class _Taken(NamedTuple):
 
 
 class _LidarMemory:
-    """Scans of one lidar, mounted at the pose ``mount`` in base, m, m, rad."""
+    """Scans from one lidar, mounted at the pose ``mount`` in the base frame (m, m, rad)."""
 
     def __init__(self, mount: Pose2) -> None:
         self.mount = mount
         self.forget()
 
     def forget(self) -> None:
-        """Forget its scans."""
+        """Discard the lidar's scans."""
         self.newest: _Taken | None = None
         self.taken: deque[_Taken] = deque(maxlen=20)
         """Scans whose points are remembered."""
@@ -105,7 +105,7 @@ class _LidarMemory:
 
 
 class _Heard(NamedTuple):
-    """Pings of one sonar."""
+    """Pings from one sonar."""
 
     views: deque[_Taken]
     """Pings kept as views of free ground."""
@@ -128,10 +128,10 @@ class ScanMemory:
 
     Args:
         footprint: the body's outline.
-        mounts: pose of every lidar in base, m, m, rad.
-        distance: distance travelled before points are forgotten, m.
-        time: age above which scans are forgotten, s.
-        deviation: standard deviation of a scan's pose relative to the body above which it is forgotten, m.
+        mounts: pose of every lidar in the base frame (m, m, rad).
+        distance: distance travelled before points are discarded (m).
+        time: age above which scans are discarded (s).
+        deviation: standard deviation of a scan's pose relative to the body above which the scan is discarded (m).
     """
 
     def __init__(
@@ -149,7 +149,7 @@ class ScanMemory:
         self.forget()
 
     def forget(self) -> None:
-        """Forget everything, because the motion of the body is unknown."""
+        """Discard everything, because the motion of the body is unknown."""
         self._pose: Pose2 = (0.0, 0.0, 0.0)
         self._travelled = 0.0
         poses_kept = 64  # number of ticks whose pose is kept, to place a scan where it was taken
@@ -167,9 +167,9 @@ class ScanMemory:
         """Move the body.
 
         Args:
-            now: ns.
-            twist: motion for the ``dt`` s before ``now`` (m/s, rad/s).
-            dt: s.
+            now: current time (ns).
+            twist: motion during the ``dt`` s before ``now`` (m/s, rad/s).
+            dt: duration of the motion (s).
             doubt: see ``TravelDoubt.distance``.
         """
         self._travel_doubt = doubt
@@ -179,16 +179,16 @@ class ScanMemory:
         self._ticks.append((now, self._pose, self._travelled))
 
     def doubt(self, place: tuple[float, float], covariance: Array) -> None:
-        """Take the pose of the base in odometry.
+        """Process the pose of the base in odometry.
 
         Args:
-            place: x, y, m.
+            place: x and y (m).
             covariance: covariance of (x, y, yaw), row-major, shape (9,), m^2, m rad, rad^2.
         """
         self._odometry = np.concatenate((place, covariance))
 
     def rest(self, scan: LaserScan | None) -> None:
-        """Process a scan of a robot at rest; discard the memory if the robot was carried.
+        """Process a scan from a robot at rest; discard the memory if the robot was carried.
 
         Args:
             scan: latest scan; None while the robot is armed, because an armed robot is not carried.
@@ -200,11 +200,11 @@ class ScanMemory:
             self._rested = scan
 
     def observe(self, scan: LaserScan, points: Array, lidar: int = 0) -> None:
-        """Take a scan.
+        """Process a scan.
 
         Args:
-            scan: the revolution.
-            points: returns of the scan near the body, in base, shape (n, 2), m.
+            scan: the scan (one revolution).
+            points: returns from the scan near the body, in the base frame (m), shape (n, 2).
             lidar: number of the lidar.
         """
         spacing = 0.02  # distance between remembered points along the sequence of beams, m: less than their drift
@@ -224,20 +224,25 @@ class ScanMemory:
         self._points = self._hidden(self._newest)
 
     def moved(self, points: Array, lidar: int) -> Array:
-        """Points (n, 2), m, in base at the latest scan of ``lidar`` as they are in base at the latest scan of all."""
+        """Transform points of ``lidar`` to the base frame at the latest of all scans.
+
+        Args:
+            points: points in the base frame at the lidar's latest scan (m), shape (n, 2).
+            lidar: number of the lidar.
+        """
         taken = self._eyes[lidar].newest
         if taken is None or self._newest is None or taken.pose == self._newest.pose:
             return points
         return points_relative(_lifted(points, taken.pose), self._newest.pose)
 
     def hear(self, sonar: str, mount: Pose2, beams: Beams, arc: Array) -> None:
-        """Take an answer of a sonar.
+        """Process an echo measured by a sonar.
 
         Args:
             sonar: name of the sonar.
-            mount: pose of the sonar in base, m, m, rad.
+            mount: pose of the sonar in the base frame (m, m, rad).
             beams: free distance across the cone.
-            arc: possible origins of the echo in base, shape (n, 2), m.
+            arc: possible origins of the echo in the base frame (m), shape (n, 2).
         """
         # Maximum number of views kept per sonar: 2.1 m of travel, longer than a cone needs to become as wide as the
         # body.
@@ -250,11 +255,17 @@ class ScanMemory:
             _keep(heard.views, taken)
 
     def silence(self, sonar: str) -> None:
-        """Forget all pings of a sonar."""
+        """Discard all pings from a sonar."""
         self._heard.pop(sonar, None)
 
     def _take(self, beams: Beams, points: Array, mount: Pose2) -> _Taken:
-        """Place a view of the sensor at ``mount``, with its points (n, 2) in base (m), at the pose of its stamp."""
+        """Place a sensor's view at the pose of its stamp.
+
+        Args:
+            beams: the view.
+            points: its points in the base frame (m), shape (n, 2).
+            mount: pose of the sensor in the base frame (m, m, rad).
+        """
         present = beams.stamp, self._pose, self._travelled
         _, pose, travelled = min(self._ticks, key=lambda tick: abs(tick[0] - beams.stamp), default=present)
         there = _lifted(points, pose)
@@ -264,7 +275,10 @@ class ScanMemory:
         )
 
     def points(self) -> Array:
-        """Remembered points outside the view of each lidar's latest scan, in base at the latest, shape (n, 2), m."""
+        """Remembered points (m) outside the view of each lidar's latest scan, shape (n, 2).
+
+        They are in the base frame at the latest scan.
+        """
         return self._points
 
     def _hidden(self, newest: _Taken) -> Array:
@@ -284,7 +298,7 @@ class ScanMemory:
         return points[~on_body(self._footprint, points, 0.0)]
 
     def echoes(self) -> Array:
-        """Points of the latest arcs of all sonars, in base at the latest scan, shape (n, 2), m."""
+        """Points on the latest arcs of all sonars (m), in the base frame at the latest scan, shape (n, 2)."""
         if self._newest is None or not self._heard:
             return np.empty((0, 2))
         arcs = np.concatenate([ping.points for heard in self._heard.values() for ping in heard.rounds])
@@ -295,9 +309,9 @@ class ScanMemory:
         return sorted((eye.newest for eye in self._eyes if eye.newest is not None), key=lambda scan: scan.beams.stamp)
 
     def _seeing(self, newest: _Taken) -> list[_Taken]:
-        """Valid views of the ground by scans and pings, oldest first, the latest scan of every lidar last.
+        """Valid views of the ground from scans and pings, oldest first, with the latest scan of every lidar at the end.
 
-        While the body stands, the latest scans are also among the kept scans.
+        While the body stands, the latest scans are also among the stored scans.
         """
         edge = 1e-6  # ground this near to a moving body counts as its edge, m
         scans = (view for eye in self._eyes for view in eye.views)
@@ -311,7 +325,7 @@ class ScanMemory:
         return [taken for taken, fresh in zip(recent, near, strict=True) if fresh]
 
     def seen(self, points: Array) -> NDArray[np.bool_]:
-        """Return whether each point (n, 2), in base at the latest scan (m), was seen free or is under the body."""
+        """Return whether each point (n, 2) was seen free or is under the body; base frame at the latest scan (m)."""
         newest = self._newest
         if newest is None:
             return on_body(self._footprint, points, DRIFT)
@@ -319,7 +333,7 @@ class ScanMemory:
         return np.asarray(self._free(self._seeing(newest), there).any(axis=0))
 
     def survey(self) -> Generator[None, None, GroundSurvey | None]:
-        """Map the seen ground around the body, in steps of well below 1 ms each."""
+        """Map the seen ground around the body, in steps that each take well below 1 ms."""
         newest = self._newest
         if newest is None:
             return None
@@ -334,7 +348,7 @@ class ScanMemory:
         return GroundSurvey(newest.beams.stamp, ages.reshape(MAP_SIZE, MAP_SIZE))
 
     def _free(self, taken: Sequence[_Taken], there: Array) -> NDArray[np.bool_]:
-        """Whether each scan saw each point (n, 2) of the memory's frame free or under the body; shape (m, n)."""
+        """Return whether each scan saw each point (n, 2) in the memory's frame free or under the body; shape (m, n)."""
         beams, distances = _beams(taken, there)
         ends = np.cumsum([len(scan.free) for scan in taken])[:, None]
         starts = np.concatenate(([[0]], ends[:-1]))
@@ -348,7 +362,7 @@ class ScanMemory:
 
 
 def elsewhere(before: LaserScan, now: LaserScan) -> bool:
-    """Whether two scans were taken in different places although the wheels stood."""
+    """Return whether two scans were taken in different places although the wheels did not turn."""
     if len(before.ranges) != len(now.ranges):
         now = _towards(before, now)
     measured = [scan.codes == VALID_BEAM for scan in (before, now)]
@@ -382,15 +396,15 @@ def spaced(points: Array, spacing: float) -> Array:
 
 
 def _lifted(points: Array, pose: Pose2) -> Array:
-    """Points (n, 2) relative to ``pose`` as points of the frame that the pose is in."""
+    """Transform points (n, 2) relative to ``pose`` to the frame in which the pose is given."""
     return placed(np.column_stack((points, np.zeros(len(points)))), pose)[:, :2]
 
 
 def _gained(taken: Sequence[_Taken], newest: _Taken) -> Array:
-    """Variance of ground remembered from each of n poses, relative to the body at the newest one, shape (n,), m^2.
+    """Variance (m^2) of ground remembered from each of n poses, relative to the body at the latest pose; shape (n,).
 
-    An error of the heading from before a pose was taken turns that pose and the way from it alike: the ground stays in
-    its place relative to the body.
+    A heading error from before a pose was taken turns that pose and the path from it by the same angle, so the ground
+    stays in place relative to the body.
     """
     before = np.array([scan.odometry for scan in taken]).reshape(-1, 11)
     dx, dy = (newest.odometry[:2] - before[:, :2]).T
@@ -406,7 +420,7 @@ def _gained(taken: Sequence[_Taken], newest: _Taken) -> Array:
 
 
 def _keep(views: deque[_Taken], taken: _Taken) -> None:
-    """Keep a scan as a view of free ground, or replace the last view if the body has stood since."""
+    """Store a scan as a view of free ground, or replace the last view if the body has not moved since."""
     # Distance (m) plus turn (rad) between two kept views of free ground: each view reaches further than the
     # length of a truck in half of all directions.
     view_step = 0.3
@@ -417,7 +431,7 @@ def _keep(views: deque[_Taken], taken: _Taken) -> None:
 
 
 def _apart(one: Pose2, other: Pose2) -> float:
-    """Sum of distance (m) and turn (rad)."""
+    """Sum of the distance (m) and the turn (rad) between two poses."""
     return math.dist(one[:2], other[:2]) + abs(one[2] - other[2])
 
 
@@ -426,10 +440,10 @@ def _beams(scans: Sequence[_Taken], points: Array) -> tuple[NDArray[np.intp], Ar
 
     Args:
         scans: m scans.
-        points: points in the frame of the memory, shape (n, 2), m.
+        points: points in the frame of the memory (m), shape (n, 2).
 
     Returns:
-        Beam numbers (out of the scan's range where it has no beam) and distances (m), both of shape (m, n).
+        Beam numbers (out of the scan's range where it has no beam) and distances (m), each of shape (m, n).
     """
     x, y = relative(points, np.array([scan.sensor for scan in scans]))
     first = np.array([scan.beams.start for scan in scans])

@@ -19,7 +19,7 @@ DRIVE_LOSSES: Final = (Reason.DEVICE_RESTARTED, Reason.DEVICE_STOPPED)
 
 
 class TickCheck(Check):
-    """Stops the robot after a pause between two ticks, until the ticks have been punctual for ``stall_dwell``."""
+    """Stops the robot after a gap between two ticks, until the ticks have been punctual for ``stall_dwell``."""
 
     reasons = (Reason.TICK_STALLED,)
 
@@ -36,17 +36,17 @@ class TickCheck(Check):
             self._pause = seen.elapsed / SECOND
 
     def reason(self, now: int) -> Iterator[Reason]:
-        """Report a recent pause."""
+        """Report a recent gap."""
         if now < self._stalled_until:
             yield Reason.TICK_STALLED
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
-        """Duration of the pause."""
+        """Duration of the gap."""
         yield Measurement(name="pause", value=self._pause, unit="s", limit=self.view.config.tick_stall)
 
 
 class DriveFaultCheck(Check):
-    """Stops the robot on a fault of a drive controller, or a loss of its service that requires arming again."""
+    """Stops the robot on a fault of a drive controller, or on a loss of its service that requires arming again."""
 
     reasons = (Reason.DRIVE_FAULT, *DRIVE_LOSSES)
 
@@ -60,7 +60,7 @@ class DriveFaultCheck(Check):
         """Losses reported before the latest tick; this tick must judge them even if they are over."""
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
-        """Take health reports of the drive services."""
+        """Process health reports from the drive services."""
         if isinstance(seen, Tick):
             self._judged, self._reported = self._reported, set()
         elif isinstance(seen, HealthTable):
@@ -96,7 +96,7 @@ class ServiceCheck(Check):
         self._failed: tuple[str, ...] = ()
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
-        """Take the health of the services."""
+        """Process the health of the services."""
         if isinstance(seen, HealthTable):
             tolerated = self.view.config.tolerated_failures
             failed = (service.name for service in seen.services if service.state is ServiceState.FAILED)
@@ -108,7 +108,7 @@ class ServiceCheck(Check):
             yield Reason.SERVICE_FAILED
 
     def text(self, reason: Reason) -> str:
-        """Reason with the names of the failed services."""
+        """Text of the reason, with the names of the failed services."""
         return f"{reason.text}: {', '.join(self._failed)}"
 
     def describe(self, reason: Reason, now: int, since: int) -> Iterator[Cause]:
@@ -157,7 +157,7 @@ class TiltCheck(Check):
         self._stop = False
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
-        """Compare the tilt of a valid attitude."""
+        """Compare the tilt of a valid attitude with the limits."""
         if isinstance(seen, Attitude) and seen is self.view.samples.attitude:
             tilt, limits = self.view.samples.tilt, self.view.config.tilt
             self._slow = tilt >= limits.slow - (limits.hysteresis if self._slow else 0.0)
@@ -180,7 +180,7 @@ class TiltCheck(Check):
 
 
 class BatteryCheck(Check):
-    """Slows the robot on a low battery or a stale battery voltage; stops it on a critical battery.
+    """Slows the robot if the battery is low or its voltage is stale; stops it if the battery is critical.
 
     Args:
         view: read access to the gate's state.
@@ -199,7 +199,7 @@ class BatteryCheck(Check):
             yield Reason.BATTERY_CRITICAL
 
     def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
-        """Limit the speed on a low battery or a stale voltage."""
+        """Limit the speed if the battery is low or its voltage is stale."""
         config, battery = self.view.config, self.view.samples.battery
         if battery is not None and battery.level is BatteryLevel.LOW:
             yield PaceLimit(Reason.BATTERY_LOW, config.battery_low_speed)

@@ -48,7 +48,7 @@ METER_DEPTH: Final = 1 << 12
 
 @dataclass(frozen=True, slots=True)
 class Lateness:
-    """Lateness of ticks against the schedule, s."""
+    """Lateness of ticks against the schedule (s)."""
 
     ticks: int
     p50: float
@@ -57,7 +57,7 @@ class Lateness:
 
 
 class TickMeter:
-    """Lateness of the latest ticks; count and maximum cover all ticks."""
+    """Lateness of recent ticks; count and maximum cover all ticks."""
 
     def __init__(self, depth: int = METER_DEPTH) -> None:
         self._ring = np.zeros(depth)
@@ -96,11 +96,11 @@ class GateService:
 
     Args:
         gate: the state machine, built with ``latched=latch.engaged()``.
-        rate: ticks per second.
-        clock: time.
+        rate: tick rate (1/s).
+        clock: time source.
         inputs: subscriptions.
         outputs: publishers.
-        events: sink of events.
+        events: receives events.
         latch: keeps the emergency stop across restarts.
         black_box: called at every stop; returns the file that will hold the preceding minute, if any.
         offload: runs blocking writes of the latch.
@@ -157,7 +157,7 @@ class GateService:
         self._feeds = [_Feed(topic, subscription, gate.observe) for topic, subscription in inputs.items()]
 
     def configure(self, config: GateConfig, weakened: tuple[str, ...]) -> None:
-        """Replace the limits from the next tick on; see ``Gate.configure``."""
+        """Replace the limits from the next tick; see ``Gate.configure``."""
         self._guarded(None, self._gate.configure, config)
         added, self._weakened = set(weakened) - set(self._weakened), weakened
         for setting in sorted(added):
@@ -178,9 +178,9 @@ class GateService:
         return self._meter.lateness()
 
     def control(self, order: ControlRequest) -> Decision:
-        """Carry out an order at once; see ``Gate.control``.
+        """Carry out an order immediately; see ``Gate.control``.
 
-        An emergency stop does not wait for the next tick: it is commanded and marked before the answer.
+        An emergency stop does not wait for the next tick: it is commanded and marked before the gate answers.
         """
         bug = Decision(Reason.INTERNAL, Reason.INTERNAL.text)
         before = self.mode
@@ -193,23 +193,23 @@ class GateService:
         return decision
 
     def request(self, request: DriveRequest) -> Reason:
-        """Take an external drive request at once; see ``Gate.request``."""
+        """Process an external drive request immediately; see ``Gate.request``."""
         return self._guarded(Reason.INTERNAL, self._gate.request, request, self._clock.now())
 
     def planner_request(self, request: DriveRequest) -> Reason:
-        """Take a drive request of the robot's planners at once; see ``Gate.planner_request``."""
+        """Process a drive request from the robot's planners immediately; see ``Gate.planner_request``."""
         return self._guarded(Reason.INTERNAL, self._gate.planner_request, request, self._clock.now())
 
     def observe_event(self, event: Event) -> None:
-        """Take an event of any service at once; see ``Gate.observe``."""
+        """Process an event from any service immediately; see ``Gate.observe``."""
         self._guarded(None, self._gate.observe, event, EVENT)
 
     def observe_health(self, table: HealthTable) -> None:
-        """Take a health table at once; see ``Gate.observe``."""
+        """Process a health table immediately; see ``Gate.observe``."""
         self._guarded(None, self._gate.observe, table, HEALTH)
 
     def shut_down(self) -> None:
-        """Command neutral from now on; ticks continue until ``run`` is cancelled."""
+        """Command neutral until ``run`` is cancelled; ticks continue."""
         self._publish(self._gate.neutral(self._clock.now()), self._clock.now())
 
     def _guarded(self, default: T, take: Callable[..., T], *arguments: object) -> T:
@@ -228,7 +228,7 @@ class GateService:
         raise self._bug
 
     async def run(self, ready: Ready) -> None:
-        """Tick until cancelled; whatever ends it, command neutral last and store the latch on the disk.
+        """Tick until cancelled; however the run ends, finally command neutral and store the latch on the disk.
 
         Orders are still accepted afterwards, until ``close``.
         """
@@ -276,7 +276,7 @@ class GateService:
         self._continue_survey(now)
 
     def _continue_survey(self, now: int) -> None:
-        """Advance the survey of seen ground by one step, and publish it at the end."""
+        """Advance the survey of seen ground by one step, and publish it when complete."""
         if self._survey is None:
             if now - self._surveyed >= SURVEY_PERIOD:
                 self._survey, self._surveyed = self._gate.survey(), now
@@ -367,8 +367,8 @@ class GateService:
     def _mark_latch(self) -> None:
         """Mark an emergency stop before it is reported; clear the mark once the file on the disk agrees.
 
-        The thread that writes the file never touches the mark. So an emergency stop ordered while the file of the
-        previous one is being removed keeps its mark.
+        The thread that writes the file never touches the mark. So an emergency stop ordered while the previous stop's
+        file is being removed keeps its mark.
         """
         marked = self.mode is GateMode.ESTOPPED and self._latched is not True
         now = self._clock.now()
@@ -439,13 +439,13 @@ GRADUAL: Final = frozenset({Order.DISARM, Order.STOP})
 def register_gate_calls(rpc: RpcRegistry, bus: Bus, clock: Clock) -> None:
     """Serve every ``Order`` under its name; the payload is a ``ControlRequest``, the answer a ``GateState``.
 
-    An order is injected on ``req/control``, so that it is recorded and checked like any other order. The answer follows
-    when the order is carried out, or refused with the reason.
+    An order is injected on ``req/control``, so it is recorded and checked like any other order. The answer follows when
+    the order has been carried out, or refused with the reason.
 
     Args:
         rpc: registry of the calls.
         bus: carries the orders to the gate.
-        clock: time.
+        clock: time source.
     """
     for order in Order:
         role = AccessRole.OBSERVER if order is Order.ESTOP else AccessRole.PILOT
@@ -480,7 +480,7 @@ def _why(state: GateState | None) -> str:
 
 
 def _is_carried_out(order: Order, state: GateState) -> bool:
-    """Whether the gate's state shows that ``order`` has been carried out."""
+    """Return whether the gate's state shows that ``order`` has been carried out."""
     mode = state.mode
     match order:
         case Order.ARM:

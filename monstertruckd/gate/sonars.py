@@ -78,7 +78,7 @@ class SonarGuard:
         self._answered |= {sonar.name: ranges.received for sonar in ranges.sonars if sonar.answered}
 
     def fresh(self, now: int) -> bool:
-        """Whether the latest round exists and is fresh."""
+        """Return whether the latest round exists and is fresh."""
         return bool(self._rounds) and now - self._rounds[-1].received <= self._limits.config.sonar.stale_after * SECOND
 
     def look(self, twist: UnitTwist, reach: float, now: int) -> SonarView:
@@ -86,8 +86,8 @@ class SonarGuard:
 
         Args:
             twist: twist of the base.
-            reach: distance swept, m.
-            now: ns.
+            reach: distance swept (m).
+            now: current time (ns).
         """
         ahead = self._ahead(twist)
         oldest = now - round(self._limits.config.sonar.stale_after * SECOND)
@@ -182,7 +182,7 @@ class SonarCheck(Check):
 
 
 def is_late(ranges: SonarRanges, config: GateConfig) -> bool:
-    """Whether a round of pings arrived too late to be used."""
+    """Return whether a round of pings arrived too late to be used."""
     return abs(ranges.received - ranges.stamp) > config.max_latency * SECOND
 
 

@@ -71,7 +71,7 @@ class Outages:
         self._link: Event | None = None
 
     def observe(self, message: Message) -> None:
-        """Take a health table, or an event of any service."""
+        """Process a health table, or an event of any service."""
         if isinstance(message, HealthTable):
             self._observe_health(message)
         elif isinstance(message, Event):
@@ -169,14 +169,14 @@ class StopLog:
         """Add a stop.
 
         Args:
-            now: ns.
+            now: current time (ns).
             mode: next mode of the gate.
             causes: causes of the stop, worst first.
             ordered: whether an ordinary order caused the stop.
             quick: whether the drives stop by quick stop.
             driver: latest request of the driving source.
             speed: measured speed, m/s; None if unknown.
-            stopping_distance: expected stopping distance, m.
+            stopping_distance: expected stopping distance (m).
         """
         self._count += 1
         self._causes, self._over = tuple(causes), {}

@@ -11,7 +11,7 @@ from monstertruckd.gate.config import InForce
 
 
 class TravelDoubt:
-    """Difference between the distances commanded and measured since the start, m.
+    """Difference between the distances commanded and measured since the start (m).
 
     A drive that follows its commands turns its shaft at a speed commanded within its reaction time, once it has
     accelerated. Any other measured speed leaves two possible distances, and nothing in the gate tells which is true.
@@ -35,9 +35,9 @@ class TravelDoubt:
         """Take the speeds of all shafts at a tick.
 
         Args:
-            now: ns.
-            dt: time since the previous tick, s.
-            commanded: commanded speed of every shaft since then, m/s.
+            now: current time (ns).
+            dt: time since the previous tick (s).
+            commanded: commanded speed of every shaft since then (m/s).
             measured: latest measured speeds, m/s; empty if unknown.
             drives: latest feedback of every shaft.
         """

@@ -63,12 +63,12 @@ class Visibility:
         self._seen_at[seen & self._field] = scan.stamp
 
     def sectors_of(self, points: Array) -> Sectors:
-        """Sector of every point (n, 2) in base, m."""
+        """Sector of every point (n, 2) in base (m)."""
         x, y, yaw = self._mount
         return _sector(np.arctan2(points[:, 1] - y, points[:, 0] - x) - yaw)
 
     def covers(self, points: Array) -> NDArray[np.bool_]:
-        """Whether each point (n, 2) in base (m) lies in the lidar's field of view."""
+        """Return whether each point (n, 2) in base (m) lies in the lidar's field of view."""
         return self._field[self.sectors_of(points)]
 
     def last_seen(self, sectors: Sectors) -> NDArray[np.int64]:
@@ -76,7 +76,7 @@ class Visibility:
         return np.where(self._field[sectors], self._seen_at[sectors], -1)
 
     def age(self, points: Array, now: int) -> NDArray[np.int64]:
-        """Time since the sector of every point (n, 2) in base was last seen, ns."""
+        """Time since the sector of every point (n, 2) in base was last seen (ns)."""
         return now - self._seen_at[self.sectors_of(points)]
 
 

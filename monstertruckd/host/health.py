@@ -99,7 +99,7 @@ class HealthBoard:
         self._publish()
 
     def _may_be_its_hub(self, row: ServiceHealth) -> bool:
-        """Whether this is the first loss of a working device on a hub."""
+        """Return whether this is the first loss of a working device on a hub."""
         first = row.state is ServiceState.BACKOFF and not (row.name in self._down or row.name in self._unplugged)
         return first and row.reason is Reason.DEVICE_LOST and row.name in self._on_hubs
 
@@ -278,5 +278,5 @@ class MeterService:
 
 
 def _again(said: int | None, now: int) -> bool:
-    """Whether a message last logged at ``said`` (ns) is due again."""
+    """Return whether a message last logged at ``said`` (ns) is due again."""
     return said is None or now - said > 60.0 * SECOND  # seconds until it is repeated

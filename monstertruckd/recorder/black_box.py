@@ -1,4 +1,4 @@
-"""Black boxes: files of the minute around a gate trip, with names, a listing and a quota."""
+"""Black boxes: files that cover the minute around a gate trip, with names, a listing and a quota."""
 
 import asyncio
 import errno
@@ -56,7 +56,7 @@ class BlackBoxFile:
 
 
 def black_boxes(directory: Path) -> list[BlackBoxFile]:
-    """The finished black boxes of a folder, oldest first; empty if the folder is missing.
+    """Return the finished black boxes in a folder, oldest first; empty if the folder is missing.
 
     Raises:
         OSError: the folder cannot be read.
@@ -89,7 +89,7 @@ class BlackBoxFolder:
         self._number = 0
 
     def scan(self) -> None:
-        """Continue the numbering of earlier runs, and remove their unfinished boxes."""
+        """Continue the numbering from earlier runs, and remove their unfinished boxes."""
         make_folder(self.directory)
         self._number = max(self._number, *(box.number for box in black_boxes(self.directory)), 0)
         for path in self.directory.glob(f"*{PART}"):
@@ -100,7 +100,7 @@ class BlackBoxFolder:
                 log.warning("%s, which an earlier run left, cannot be removed: %s", path, error.strerror)
 
     def next_name(self, reason: Reason) -> str:
-        """Return the name of the next box, without access to the disk."""
+        """Return the name of the next box, without disk access."""
         self._number += 1
         return f"blackbox-{self._number:06d}-{reason.value}.mcap"
 
@@ -121,7 +121,7 @@ class BlackBoxFolder:
         return self.directory / (name + PART)
 
     def finish(self, name: str) -> None:
-        """Give the complete box its name, synced to disk, and remove old boxes beyond the quota."""
+        """Rename the complete box to its final name, synced to disk, and remove old boxes beyond the quota."""
         self.part(name).replace(self.directory / name)
         sync_folder(self.directory)
         self._keep_quota()
@@ -148,7 +148,7 @@ class BlackBoxFolder:
 
 @dataclass(slots=True)
 class _Pending:
-    """Black box that is to be written at the time ``due``."""
+    """Black box to be written at the time ``due``."""
 
     name: str
     reason: Reason
@@ -164,18 +164,18 @@ class _Pending:
 
 
 class BlackBox:
-    """Keeps the latest messages in memory and writes them when the gate trips; runs while its ``async with`` body does.
+    """Keeps the latest messages in memory and writes them when the gate trips; active within its ``async with`` body.
 
     Every trip is in a box: a new one, the box of a trip shortly before, or, within ``interval`` of a box for the same
     reason, a later one. When the body ends, pending boxes are written before the context exits, unless that takes
-    longer than ``LAST_SECONDS``. If the disk is full, fails or is too slow, the box is lost; this is reported and has
-    no other effect.
+    longer than ``LAST_SECONDS``. If the disk is full, fails or is too slow, the box is lost; the loss is reported and
+    has no other effect.
 
     Args:
-        config: spans and limits.
-        directory: folder of the boxes.
-        clock: daemon time.
-        events: sink for saved and lost boxes.
+        config: time spans and limits.
+        directory: folder for the boxes.
+        clock: daemon clock.
+        events: receives events for saved and lost boxes.
         attachments: JSON-serialisable values in every box, as ``<name>.json``.
         metadata: text about the run, in every box.
         offload: runs the writing of boxes.
@@ -250,7 +250,7 @@ class BlackBox:
             await asyncio.wait((self._taking, self._saving))
 
     def freeze(self) -> None:
-        """Take the content of the pending boxes now, before the end; they are written when the context exits."""
+        """Capture the content of the pending boxes before they are due; they are written when the context exits."""
         self._frozen += [(pending, self.ring.snapshot()) for pending in self._pending]
         self._pending.clear()
         self._wake.set()
@@ -272,7 +272,7 @@ class BlackBox:
         """Register a trip of the gate.
 
         Returns:
-            Name of its future box, which may contain other trips; None if this reason writes no box.
+            Name of the future box, which may contain other trips; None if this reason writes no box.
         """
         if trip.reason in self._config.unless:
             return None
@@ -287,7 +287,7 @@ class BlackBox:
         return pending.name
 
     def _allowed(self, trip: Stop) -> int:
-        """Return the earliest time of another box for this reason, while it would still contain the trip."""
+        """Return the earliest time for another box with this reason that would still contain the trip."""
         last = self._last.get(trip.reason)
         if last is None:
             return trip.stamp
@@ -295,7 +295,7 @@ class BlackBox:
         return min(last + interval, trip.stamp + before)
 
     async def _take(self) -> None:
-        """Take the content of each box when it is due, whatever the state of the disk."""
+        """Capture the content of each box when it is due, whatever the state of the disk."""
         while not self._closing:
             pending = min(self._pending, key=attrgetter("due"), default=None)
             if not await self._is_due(pending) or pending not in self._pending:

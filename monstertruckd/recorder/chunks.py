@@ -22,9 +22,9 @@ def unpacked(chunk: Chunk) -> bytes:
     """Return the content of a chunk, decompressed and checked.
 
     Raises:
-        McapError: it exceeds ``MOST_UNPACKED``, differs from its declared size, or fails its checksum.
-        RuntimeError: damaged lz4 data.
-        zstandard.ZstdError: damaged zstd data.
+        McapError: the content exceeds ``MOST_UNPACKED``, differs from its declared size, or fails its checksum.
+        RuntimeError: the lz4 data is damaged.
+        zstandard.ZstdError: the zstd data is damaged.
     """
     size = chunk.uncompressed_size
     if size > MOST_UNPACKED:

@@ -74,7 +74,7 @@ PRIVATE: Final = 0x80
 
 
 def is_finished(path: Path) -> bool:
-    """Whether the file ends like a finished log."""
+    """Return whether the file has the ending of a finished log."""
     with path.open("rb") as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(-min(size, len(MAGIC)), os.SEEK_END)
@@ -82,7 +82,7 @@ def is_finished(path: Path) -> bool:
 
 
 def index_is_sound(file: BinaryIO) -> bool:
-    """Whether a log is finished and its index, if it has one, matches the checksum.
+    """Return whether a log is finished and its index, if it has one, matches the checksum.
 
     Args:
         file: the log; its position changes.
@@ -99,7 +99,7 @@ def index_is_sound(file: BinaryIO) -> bool:
 
 
 def _checksum(file: BinaryIO, begin: int, end: int) -> int:
-    """CRC-32 of the bytes from ``begin`` up to ``end``, read in pieces."""
+    """CRC-32 of the bytes from ``begin`` to before ``end``, read in pieces."""
     file.seek(begin)
     value = 0
     piece = 1 << 20
@@ -127,7 +127,7 @@ def read_frame(file: BinaryIO, size: int) -> tuple[int, bytes, bytes]:
 
 
 def read_statistics(file: BinaryIO, size: int) -> Statistics | None:
-    """Return the statistics of the sound index at the position of ``file``, or None."""
+    """Return the statistics in the undamaged index at the position of ``file``, or None."""
     while True:
         opcode, _, content = read_frame(file, size)
         if opcode == Opcode.STATISTICS:
@@ -158,11 +158,11 @@ def checked_attachment(record: Attachment, content: bytes) -> Attachment:
 
 
 def open_file(path: Path) -> BinaryIO:
-    """Open a log for reading, without checking its content.
+    """Open a log for reading without checking its content.
 
     Raises:
-        NotFoundError: no such file.
-        InputError: it is a folder, or cannot be read.
+        NotFoundError: the file does not exist.
+        InputError: the path is a folder, or the file cannot be read.
     """
     try:
         require_file(path)

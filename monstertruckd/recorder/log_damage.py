@@ -1,4 +1,4 @@
-"""Damage of a log in figures and words, shared by the reader and the repair."""
+"""Damage to a log in figures and words, shared by the reader and the repair."""
 
 from dataclasses import dataclass
 
@@ -25,7 +25,7 @@ class LogDamage:
 
     @property
     def costs(self) -> bool:
-        """Whether messages are or may be lost."""
+        """Whether messages are lost or may be lost."""
         return self.lost > 0 or not self.counted
 
     @property
@@ -51,12 +51,12 @@ def _span_text(start: float, end: float | None) -> str:
 
 
 def repetition(chunks: int) -> str:
-    """Describe the damage of a log that holds this number of chunks twice."""
+    """Describe the damage to a log that contains this number of chunks twice."""
     return f"contains {chunks} chunk{'s' if chunks > 1 else ''} twice"
 
 
 def judged(salvage: Salvage) -> LogDamage:
-    """Return the damage found by a salvage after all records were read."""
+    """Return the damage found by a salvage once all records have been read."""
     spans = salvage.spans()
     begin = min((time for time in (salvage.first, *(span.start for span in spans)) if time is not None), default=0)
     damage = list(salvage.flaws)

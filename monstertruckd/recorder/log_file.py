@@ -81,11 +81,11 @@ RUN_LOG: Final = "log"
 
 
 def log_offset(now: int, real_offset: int) -> int:
-    """Return the offset that a file starting now adds to daemon times for its log times (ns).
+    """Return the offset that a file starting now adds to daemon times to obtain log times (ns).
 
     Args:
         now: daemon time (ns).
-        real_offset: real (UNIX) minus daemon time (ns).
+        real_offset: real (UNIX) time minus daemon time (ns).
 
     Returns:
         ``real_offset``, or 0 while the computer does not know the date.
@@ -186,12 +186,12 @@ class LogFile:
             self.open_since = entry.log_time
 
     def flush(self) -> None:
-        """Close the open chunk and pass it to the kernel, so it survives the process."""
+        """Close the open chunk and pass it to the kernel, so that it survives the end of the process."""
         self._writer.flush()  # type: ignore[no-untyped-call]
         self.open_since = None
 
     def sync(self) -> None:
-        """Wait until the data is on disk, so it survives a power cut."""
+        """Wait until the data is on disk, so that it survives a power cut."""
         if self._channels.numbers:
             self._writer.add_metadata(CHANNELS, self._channels.numbers)
         self._settle()
@@ -203,7 +203,7 @@ class LogFile:
             self._named = True
 
     def finish(self) -> None:
-        """Write the index and close."""
+        """Write the index and close the file."""
         try:
             self._writer.finish()  # type: ignore[no-untyped-call]
             self._settle()
@@ -211,12 +211,12 @@ class LogFile:
             self._output.close()
 
     def abandon(self) -> None:
-        """Close without an index; the file is repaired at the next start."""
+        """Close the file without an index; it is repaired at the next start."""
         self._output.close()
 
 
 class _PackedIndex:
-    """Index of a chunk, as the bytes at the end of the file.
+    """Index of a chunk, stored as its bytes at the end of the file.
 
     Args:
         index: index created by the writer.
@@ -238,7 +238,7 @@ class _PackedIndexes(list[_PackedIndex]):
     """Chunk indexes, packed when they are appended.
 
     With two chunks per second and forty channels each, the writer's objects grow by 0.34 MB per minute until the
-    recording ends; packed, by 0.06 MB per minute.
+    recording ends; packed indexes grow by 0.06 MB per minute.
     """
 
     def append(self, index: Any) -> None:
@@ -254,7 +254,7 @@ def _pack_indexes(writer: Writer) -> None:
 
 
 class _Output:
-    """Unbuffered file: written data is in the kernel, so an error leaves nothing to flush."""
+    """Unbuffered file: written data is already in the kernel, so an error leaves nothing to flush."""
 
     def __init__(self, path: Path) -> None:
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
@@ -289,7 +289,7 @@ class _Output:
 
 
 class LogFolder:
-    """Numbered log files of one folder: ``run-<run>-<part>.mcap``, in order of age."""
+    """Numbered log files in one folder: ``run-<run>-<part>.mcap``, in order of age."""
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
@@ -310,12 +310,12 @@ class LogFolder:
         return path
 
     def next_run(self) -> None:
-        """Switch to the next run number, because another process uses this one."""
+        """Switch to the next run number because another process uses this one."""
         self._run += 1
         self._part = 0
 
     def finished(self, current: Path) -> dict[Path, int]:
-        """Return the size of every log except ``current``, oldest first, each after its damaged originals.
+        """Return the size of every log except ``current``, oldest first; each log follows its damaged originals.
 
         ``repair`` keeps these originals. Entries that are not regular files are ignored.
         """

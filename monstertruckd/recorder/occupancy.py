@@ -1,4 +1,4 @@
-"""Growing raster of hits and passes of lidar scans."""
+"""Growing raster of lidar scans: the number of hits and passes per cell."""
 
 from dataclasses import dataclass
 
@@ -43,7 +43,7 @@ class OccupancyRaster:
 
         Args:
             origin: position of the sensor in the map frame (m), shape (2,).
-            points: ends of its beams in the map frame (m), shape (n, 2).
+            points: end points of the beams in the map frame (m), shape (n, 2).
         """
         points = points[np.isfinite(points).all(axis=1)]
         if len(points) == 0:
@@ -68,7 +68,7 @@ class OccupancyRaster:
         return np.floor(points / self.cell).astype(np.int64)
 
     def _cover(self, ends: NDArray[np.int64], origin: NDArray[np.int64]) -> None:
-        """Grow until the cells of the beams' ends and origin are inside."""
+        """Grow the raster until it contains the beams' end points and origin."""
         columns, rows = ends.T
         low = np.minimum((columns.min(), rows.min()), origin)
         high = np.maximum((columns.max(), rows.max()), origin) + 1

@@ -1,4 +1,4 @@
-"""Picture of the path over the scan map: feeds the renderer worker and saves its pictures."""
+"""Picture of the path over the scan map: feeds the rendering worker and saves its pictures."""
 
 import math
 from typing import Any
@@ -26,14 +26,14 @@ class MapService:
     """Passes one scan per period to the worker; saves the picture whenever a path has ended.
 
     Args:
-        config: periods, deadline, file.
+        config: periods, deadline and file.
         mount: mounting pose of the lidar.
         clock: time source.
         scan: lidar scans.
         pose: pose in the map frame.
         path: tracked path.
-        tracker: progress on the path.
-        events: sink for finished pictures.
+        tracker: progress along the path.
+        events: receives an event for each finished picture.
     """
 
     name = ServiceName.MAP.value
@@ -85,7 +85,7 @@ class MapService:
                     await worker.step({"scans": scans})
 
     def _ended(self) -> TrackerState | None:
-        """Return the state at the end of a path since the last check, however briefly it was reported."""
+        """Return the state at the end of a path since the last check, however briefly that state was reported."""
         ended = None
         for state in self._tracker.drain():
             if state.outcome is not Reason.DRIVING and self._before is Reason.DRIVING:

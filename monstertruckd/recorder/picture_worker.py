@@ -85,10 +85,10 @@ def _save(file: Path, data: bytes) -> None:
 def render(
     raster: OccupancyRaster, *, title: str, subtitle: str = "", paths: Sequence[Mapping[str, Any]] = ()
 ) -> bytes:
-    """Draw ``paths`` over ``raster`` with title, legend and scale bar; returns a PNG.
+    """Draw ``paths`` over ``raster`` with title, legend and scale bar; return a PNG.
 
     Raises:
-        KeyError: unknown style.
+        KeyError: a path has an unknown style.
     """
     drawn = [(path["name"], STYLES[path["style"]], np.asarray(path["poses"], dtype=np.float64)) for path in paths]
     frame = _Frame.around(_shown(raster, [poses for _, _, poses in drawn if len(poses)]))
@@ -156,7 +156,7 @@ class _Frame:
 
 
 def _shown(raster: OccupancyRaster, paths: list[Array]) -> Area:
-    """Return the area of everything seen and driven, with a margin."""
+    """Return the area of everything seen and travelled, with a margin."""
     seen = ~np.isnan(raster.occupancy())
     corners = [path[:, :2] for path in paths]
     if seen.any():

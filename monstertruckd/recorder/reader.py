@@ -57,7 +57,7 @@ def spare_log(output: Path) -> None:
 
 
 def joined(records: Iterable[McapRecord]) -> Iterator[tuple[McapMessage, Channel, Schema | None]]:
-    """Yield the messages among MCAP records, each with its channel and its schema."""
+    """Yield the messages among MCAP records, each with its channel and schema."""
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     for record in records:
@@ -98,14 +98,14 @@ class LogMessage:
 
 
 class LogReader:
-    """Iterates over a log, any number of times; of a damaged file, over every intact chunk, like ``recover``.
+    """Iterates over a log, any number of times; in a damaged file, over every intact chunk, as ``recover`` does.
 
     Args:
         path: MCAP file.
 
     Raises:
-        NotFoundError: no such file.
-        InputError: not an MCAP file.
+        NotFoundError: the file does not exist.
+        InputError: the file is not an MCAP file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -146,12 +146,12 @@ class LogReader:
             )
 
     def records(self, *, past_damage: bool = True) -> Iterator[McapRecord]:
-        """Yield every intact MCAP record before the index, with chunks opened; channels precede their messages.
+        """Yield every intact MCAP record before the index, with chunks unpacked; channels precede their messages.
 
         Times are as in the file; see ``log_offset``.
 
         Args:
-            past_damage: continue after an error.
+            past_damage: whether to continue after an error.
         """
         self.damage, self.flaws, self.verdict, self.log_offset = None, [], None, 0
         size = self.size
@@ -201,7 +201,7 @@ class LogReader:
                 yield record
 
     def _learn(self, record: McapRecord) -> None:
-        """Store the offset of the log times from daemon time.
+        """Store the offset between log times and daemon times.
 
         Raises:
             ValueError: the offset is not a number.
@@ -210,7 +210,7 @@ class LogReader:
             self.log_offset = int(record.metadata.get(LOG_OFFSET, "0"))
 
     def _opened(self, opcode: int, content: bytes) -> Iterable[McapRecord]:
-        """Return the records contained in a record of the data section: the content of a chunk, or the record."""
+        """Return the records in a record of the data section: the content of a chunk, or the record itself."""
         stream = ReadDataStream(BytesIO(content))
         match opcode:
             case Opcode.CHUNK:
@@ -254,7 +254,7 @@ class LogReader:
             self.flaws.append("lacks an attachment or metadata")
 
     def _salvaged(self, file: BinaryIO, first: str) -> Iterator[McapRecord]:
-        """Yield the intact records from ``position`` on; the damage is known after the last one.
+        """Yield the intact records starting at ``position``; the damage is known after the last record.
 
         Args:
             file: the log.
@@ -293,7 +293,7 @@ class LogReader:
             self.damage, self.flaws, self.verdict = known
 
     def config(self) -> dict[str, Any]:
-        """Return the attached configuration as plain values, or an empty one. Raises like ``attached_config``."""
+        """Return the attached configuration as plain values, or an empty dict. Raises as ``attached_config`` does."""
         return attached_config(self.path, self.attachments()) or {}
 
     @property
@@ -316,7 +316,7 @@ class LogReader:
 
 
 def _resembles(head: bytes) -> bool:
-    """Whether these first bytes may be from a damaged log: part of the magic is left, or all are zeros."""
+    """Return whether these first bytes may be from a damaged log: part of the magic remains, or all bytes are zero."""
     return not any(head) or any(one == other for one, other in zip(head, MAGIC, strict=False))
 
 

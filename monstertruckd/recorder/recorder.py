@@ -1,4 +1,4 @@
-"""Recorder: accepts encoded messages on the event loop; its thread writes, rotates and keeps the quota."""
+"""Recorder: accepts encoded messages on the event loop; its thread writes and rotates files and enforces the quota."""
 
 import asyncio
 import hashlib
@@ -51,17 +51,17 @@ _STEP: Final = SECOND
 
 
 class LogWriter:
-    """Writes entries into numbered files; a context manager that finishes the last one.
+    """Writes entries to numbered files; a context manager that finishes the last file.
 
-    All dates of a file use one offset; when the clock of the computer is set, a new file begins. A new file also begins
+    All log times in a file use one offset; when the computer's clock is set, a new file begins. A new file also begins
     if the file was removed, which is detected at the next sync.
 
     Args:
         config: sizes, durations and folder.
         attachments: JSON-serialisable values attached to every file, by name.
         metadata: text about the run, in every file.
-        start: daemon time of the start of the first file (ns).
-        real_offset: real (UNIX) minus daemon time (ns).
+        start: daemon time at the start of the first file (ns).
+        real_offset: real (UNIX) time minus daemon time (ns).
 
     Raises:
         OSError: from every method: the disk is full or fails.
@@ -120,7 +120,7 @@ class LogWriter:
         self._file.add(entry)
 
     def tick(self, now: int) -> None:
-        """Close the chunk, sync the file and keep the quota if due at log time ``now``."""
+        """Close the chunk, sync the file and enforce the quota if due at log time ``now``."""
         since = self._file.open_since
         if since is not None and now - since >= self._config.chunk_seconds * SECOND:
             self._file.flush()
@@ -133,7 +133,7 @@ class LogWriter:
                 log.warning("%s was removed while it was being written: its content is lost", self.path)
 
     def _is_complete(self, now: int) -> bool:
-        """Whether a new file is due: by removal, size, age, or because the clock of the computer was set."""
+        """Return whether a new file is due because of removal, size or age, or because the computer's clock was set."""
         age = now - self._file.start
         if self._removed or self._file.size >= self._config.rotate_bytes or age >= self._config.rotate_seconds * SECOND:
             return True
@@ -251,7 +251,7 @@ class Recorder:
 
     @property
     def path(self) -> Path | None:
-        """File being written; None before the first one is open."""
+        """File being written; None before the first file is open."""
         return self._path
 
     async def __aenter__(self) -> Self:

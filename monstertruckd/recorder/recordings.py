@@ -1,7 +1,8 @@
 """Remote calls for the recordings on the robot: list, read in chunks, delete.
 
-Downloads must not disturb the robot: chunks are small, a delay of each answer limits their rate, a thread reads the
-files, and one source downloads at a time. Names are matched against the existing files, so a path is never accepted.
+Downloads must not disturb the robot: chunks are small, each answer is delayed to limit the rate, a thread reads the
+files, and only one source downloads at a time. Names are matched against the existing files, so a path is never
+accepted.
 """
 
 import asyncio

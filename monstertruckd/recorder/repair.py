@@ -52,7 +52,7 @@ class Recovery(LogDamage):
 
 
 def in_use(path: Path) -> bool:
-    """Whether a recorder or a repair has locked the file; two simultaneous callers do not see each other."""
+    """Return whether a recorder or a repair has locked the file; two simultaneous callers do not detect each other."""
     with path.open("rb") as file:
         return not _lock(file, fcntl.LOCK_SH)
 
@@ -128,12 +128,12 @@ def _keep(source: Path) -> Path:
 
 
 def recover_directory(directory: Path, stop: threading.Event | None = None) -> list[Recovery]:
-    """Repair every unfinished log of a folder in place; files in use and other files are skipped."""
+    """Repair every unfinished log in a folder in place; files in use and other files are skipped."""
     return [outcome for outcome in _repairs(directory, stop) if isinstance(outcome, Recovery)]
 
 
 def _repairs(directory: Path, stop: threading.Event | None = None) -> Iterator[Recovery | TruckError | OSError]:
-    """Repair every unfinished log of a folder; log and yield each outcome."""
+    """Repair every unfinished log in a folder; log and yield each outcome."""
     for path in sorted(directory.glob("*.mcap")):
         try:
             if not _unfinished(path):
@@ -150,7 +150,7 @@ def _repairs(directory: Path, stop: threading.Event | None = None) -> Iterator[R
 
 
 def _unfinished(path: Path) -> bool:
-    """Whether a log needs repair; a folder or pipe of that name does not.
+    """Return whether a log needs repair; a folder or pipe with such a name does not.
 
     Raises:
         OSError: the log cannot be read.
@@ -197,7 +197,7 @@ def _copy(salvage: Salvage, source: Path, output: BinaryIO, stop: threading.Even
 
 
 class _Registered:
-    """Channels and schemas of a new file, each once."""
+    """Channels and schemas of a new file, each registered once."""
 
     def __init__(self, writer: Writer) -> None:
         self._writer = writer
@@ -238,7 +238,7 @@ def repairs(process: "subprocess.Popen[bytes]") -> Iterator[str]:
 
 
 def _may_wait(path: Path) -> bool:
-    """Whether a log may need repair; the repair process reports unreadable logs."""
+    """Return whether a log may need repair; the repair process reports unreadable logs."""
     try:
         return _unfinished(path)
     except OSError:

@@ -1,7 +1,7 @@
 """Ring of recent messages in memory, bounded by time and size; the source of black boxes.
 
 Messages are stored contiguously in blocks: times, topic number, payload. Each block is a separate memory map, which
-returns to the kernel at once. Python objects would fragment the heap, and the daemon would grow for hours.
+returns to the kernel immediately. Python objects would fragment the heap, and the daemon would grow for hours.
 """
 
 from collections import deque
@@ -92,7 +92,7 @@ class RingSnapshot:
 
     Args:
         heads: last messages of retained topics before the window; they get the log time of its start.
-        views: views of the parts; the first one that is not empty starts the window.
+        views: views of the parts; the first non-empty view starts the window.
     """
 
     def __init__(self, heads: tuple[LogEntry, ...], views: tuple[_View, ...]) -> None:
@@ -168,7 +168,7 @@ class _Part:
         return entry
 
     def expired(self, now: int) -> bool:
-        """Whether the oldest entry is too old."""
+        """Return whether the oldest entry is too old."""
         return self._count > 0 and now - self.oldest > self._span
 
     def view(self) -> _View:
@@ -211,7 +211,7 @@ class Ring:
 
     @property
     def size(self) -> int:
-        """Size of the blocks (bytes), without the kept messages of retained topics."""
+        """Size of the blocks (bytes), excluding the stored messages of retained topics."""
         return self._rest.size + self._journal.size + self._sampled.size + self._fresh.size
 
     def add(self, entry: LogEntry) -> None:
@@ -225,7 +225,7 @@ class Ring:
             self._trim()
 
     def snapshot(self) -> RingSnapshot:
-        """Return a snapshot of the ring; copies only the list of blocks, however many messages there are."""
+        """Return a snapshot of the ring; only the list of blocks is copied, however many messages there are."""
         self._trim()
         parts = (self._rest, self._journal, self._sampled, self._fresh)
         return RingSnapshot(tuple(self._heads.values()), tuple(part.view() for part in parts))

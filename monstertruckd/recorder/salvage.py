@@ -1,9 +1,9 @@
 """Salvage of intact records from a damaged log: every chunk with a valid checksum, anywhere in the file.
 
-The file is read from start to end, record by record. After an invalid record, the next valid one is searched byte by
-byte: a chunk is valid if its checksum matches, another record if its lengths are consistent. The bytes between are a
-gap. Channels come from the chunks, the index, and the metadata that the recorder repeats (``CHANNELS``), so a message
-can be read even if the chunk that introduced its channel is lost.
+The file is read from start to end, record by record. After an invalid record, the reader searches for the next valid
+record byte by byte: a chunk is valid if its checksum matches, any other record if its lengths are consistent. The bytes
+skipped are a gap. Channels come from the chunks, the index, and the metadata that the recorder repeats (``CHANNELS``),
+so a message can be read even if the chunk that introduced its channel is lost.
 """
 
 import errno
@@ -64,7 +64,7 @@ UNKNOWN: Final = "unknown/channel-{}"
 
 
 class Span(NamedTuple):
-    """Log time interval with lost messages (ns); None: from the start, or to the end."""
+    """Log time interval with lost messages (ns); None as a limit means from the start, or to the end."""
 
     start: int | None
     end: int | None
@@ -81,7 +81,7 @@ class ChannelFacts(NamedTuple):
 
 
 class _Bytes:
-    """Bytes of a file; unreadable ones are zeros.
+    """Bytes of a file; unreadable bytes are returned as zeros.
 
     Args:
         file: file opened for reading.
@@ -92,7 +92,7 @@ class _Bytes:
         self.size = os.fstat(self._descriptor).st_size
 
     def at(self, begin: int, size: int) -> bytes:
-        """Return ``size`` bytes from ``begin``, fewer at the end."""
+        """Return ``size`` bytes from ``begin``, or fewer at the end of the file."""
         sector = 4096  # unit of unreadable data on a disk (bytes)
         try:
             return os.pread(self._descriptor, size, begin)
@@ -106,11 +106,11 @@ class _Bytes:
             return self.at(begin, middle - begin) + self.at(middle, begin + size - middle)
 
     def is_magic(self, at: int) -> bool:
-        """Whether the magic bytes are at this offset."""
+        """Return whether the magic bytes are at this offset."""
         return self.at(at, len(MAGIC)) == MAGIC
 
     def next_candidate(self, at: int) -> int:
-        """Return the next possible start of a record from ``at`` on, or the end of the file."""
+        """Return the next possible start of a record at or after ``at``, or the end of the file."""
         window = 1 << 20  # bytes searched at once
         while at < self.size:
             found = _CANDIDATE.search(self.at(at, window + HEAD.size))
@@ -301,7 +301,7 @@ class _WholeRecord(NamedTuple):
         """Return the record, whose lengths are consistent.
 
         Raises:
-            McapError: inconsistent lengths; or one of ``DAMAGE``.
+            McapError: the lengths are inconsistent. Any error in ``DAMAGE`` may also be raised.
         """
         content = self.content(data)
         stream = ReadDataStream(BytesIO(content))
@@ -465,7 +465,7 @@ class _Scan:
         return bool(size == part.length - _INDEX_HEAD.size and size % _INDEX_ENTRY == 0)
 
     def _adds_up(self, part: _WholeRecord) -> bool:
-        """Whether the lengths of a chunk are consistent; checked before reading all of it."""
+        """Return whether the lengths of a chunk are consistent; checked before reading all of it."""
         head = self._data.at(part.offset + HEAD.size, _CHUNK_HEAD.size)
         if len(head) < _CHUNK_HEAD.size:
             return False
@@ -474,7 +474,7 @@ class _Scan:
         return len(size) == _SIZE.size and _CHUNK_HEAD.size + named + _SIZE.size + _SIZE.unpack(size)[0] == part.length
 
     def _is_followed(self, part: _WholeRecord) -> bool:
-        """Whether the record is followed by the end of the file or by a record head."""
+        """Return whether the end of the file or a record head follows the record."""
         rest = self._data.size - part.end
         if rest == 0 or self._data.is_magic(part.end):
             return True
@@ -496,7 +496,7 @@ class _Scan:
         return in_step or part.opcode != Opcode.ATTACHMENT or self._is_sealed(part)
 
     def _is_sealed(self, part: _WholeRecord) -> bool:
-        """Whether an intact record has a matching checksum."""
+        """Return whether an intact record has a matching checksum."""
         if part.opcode != Opcode.ATTACHMENT:
             return part.opcode == Opcode.CHUNK
         record = part.read(self._data)

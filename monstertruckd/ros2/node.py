@@ -64,7 +64,7 @@ class RosNode(Protocol):
         """Number of malformed messages and requests so far."""
 
     def present(self, sender: RosSender) -> bool:
-        """Whether the graph still has this node."""
+        """Return whether the graph still has this node."""
 
 
 def sole_publisher(

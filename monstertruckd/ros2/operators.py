@@ -99,7 +99,7 @@ def frame_in(header: RosMessage, frames: tuple[str, ...]) -> str:
 
 
 def check_header(header: RosMessage, now: int, frames: tuple[str, ...]) -> None:
-    """Check the header of a message that drives; raises the errors of ``check_age`` and ``frame_in``."""
+    """Check the header of a message that drives; raises the same errors as ``check_age`` and ``frame_in``."""
     check_age("its header's stamp", header, now)
     frame_in(header, frames)
 
@@ -239,7 +239,7 @@ class Operators:
         """Return the session of a node; it is opened on first use.
 
         Raises:
-            BusyError: too many nodes are connected.
+            BusyError: there are too many nodes are connected.
             TruckError: the robot cannot be reached.
         """
         if sender in self._operators:

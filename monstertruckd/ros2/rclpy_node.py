@@ -162,7 +162,7 @@ class RclpyNode:
         return str(self._node.resolve_topic_name(name))
 
     def present(self, sender: RosSender) -> bool:
-        """Whether the graph still has this node."""
+        """Return whether the graph still has this node."""
         names = {f"{space.rstrip('/')}/{name}" for name, space in self._node.get_node_names_and_namespaces()}
         return sender is CLIENTS or sender.node in names
 

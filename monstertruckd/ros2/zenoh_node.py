@@ -206,7 +206,7 @@ class ZenohNode:
         return RosSender(entity.qualified_node, entity.owner)
 
     def present(self, sender: RosSender) -> bool:
-        """Whether the graph still has this node."""
+        """Return whether the graph still has this node."""
         return any(entity.owner == sender.key for entity in self._graph.values())
 
     def qualified(self, name: str) -> str:

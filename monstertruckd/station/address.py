@@ -20,7 +20,7 @@ def _option(robot: str, endpoint: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class RobotAddress:
-    """Name of a robot, and the listening endpoint of the robot or of a router connected to it."""
+    """Name of a robot, and an endpoint at which the robot, or a router connected to it, listens."""
 
     name: str
     endpoint: str
@@ -30,8 +30,8 @@ class RobotAddress:
         """Parse ``NAME@ENDPOINT``; without an endpoint, use the robot of this name on this machine.
 
         Raises:
-            InputError: the name is not valid in a key, the endpoint is invalid, or several robots of this machine have
-                the name; lists these robots.
+            InputError: the name is not valid in a key, the endpoint is invalid, or several robots on this machine have
+                the name; the message lists these robots.
         """
         name, at, endpoint = text.partition("@")
         if not _NAME.fullmatch(name):
@@ -45,12 +45,13 @@ class RobotAddress:
         """Return the default robot of a station.
 
         Raises:
-            InputError: several robots of this machine match, or none answers at the default port; lists the robots.
+            InputError: several robots on this machine match, or none answers at the default port; the message lists the
+                robots.
         """
         return cls("truck", only_robot(None, _option))
 
     def session(self, program: str, clock: Clock, timeout: float) -> TruckClient:
-        """Return a session with the robot for a program of the station; ``timeout`` as in ``TruckClient`` (s)."""
+        """Return a session with the robot for a program of the station; for ``timeout`` (s) see ``TruckClient``."""
         tls = tls_for(self.endpoint)
         source = own_source(None if tls is None else tls.owner(), program)
         return TruckClient(self.name, self.endpoint, source=source, clock=clock, timeout=timeout, tls=tls)

@@ -37,7 +37,7 @@ class Calibrator(Protocol):
     """Interface to the calibration wizards."""
 
     async def offered(self, truck: TruckClient) -> list[dict[str, Any]]:
-        """Return the wizards for this robot, in the recommended order: id, name, doc, options, whether due."""
+        """Return the wizards for this robot in the recommended order: id, name, doc, options, and whether it is due."""
 
     async def measure(self, truck: TruckClient, step: str, options: Mapping[str, Any], panel: "PagePanel") -> Measured:
         """Run a wizard; ``options`` override its defaults.
@@ -48,7 +48,7 @@ class Calibrator(Protocol):
 
 
 class PagePanel:
-    """Connects a wizard with the operator at a browser.
+    """Connects a wizard to the operator at a browser.
 
     Args:
         show: called after every change.
@@ -77,7 +77,7 @@ class PagePanel:
         self._show()
 
     def plot(self, plot: Any) -> None:
-        """Show measurements; ``plot`` has a name, labels of both axes, points and optionally a curve."""
+        """Show measurements; ``plot`` has a name, labels for its axes, points and optionally a curve."""
         self.drawn = {
             "name": plot.name,
             "x": plot.x,
@@ -92,7 +92,7 @@ class PagePanel:
         return float(await self._ask(kind="number", name=step.name, text=step.question, low=step.low, high=step.high))
 
     async def confirm(self, step: Any) -> bool:
-        """Ask for yes or no; unless it is a ``fact``, no ends the wizard."""
+        """Ask for yes or no; unless the step is a ``fact``, the answer no ends the wizard."""
         return bool(await self._ask(kind="confirm", name=step.name, text=step.question, fact=step.fact))
 
     async def _ask(self, **question: Any) -> float | bool:
@@ -107,7 +107,7 @@ class PagePanel:
         return value
 
     def answer(self, value: float | bool) -> None:
-        """Answer the question.
+        """Answer the pending question.
 
         Raises:
             InputError: no question is pending, or the number is out of bounds.
@@ -123,13 +123,13 @@ class PagePanel:
 
 
 class Calibration:
-    """Calibration by one browser: one wizard at a time.
+    """Calibration from one browser: one wizard at a time.
 
     Args:
         address: address of the robot.
-        program: name of the session with it.
+        program: name of the session with the robot.
         clock: clock of the station.
-        calibrator: the wizards.
+        calibrator: the calibration wizards.
         viewer: outbox of the browser.
     """
 
@@ -182,11 +182,11 @@ class Calibration:
         self._task = asyncio.create_task(self._run(step, options), name=f"calibration {step}")
 
     def answer(self, value: float | bool) -> None:
-        """Answer the wizard's question; raises the errors of ``PagePanel.answer``."""
+        """Answer the wizard's question; raises the same errors as ``PagePanel.answer``."""
         self._panel.answer(value)
 
     def decide(self, *, accept: bool) -> None:
-        """Accept the result, or discard it; a wizard that still measures is cancelled.
+        """Accept or discard the result; a wizard that is still measuring is cancelled.
 
         Raises:
             InputError: there is no result to accept.
@@ -228,7 +228,7 @@ class Calibration:
 
 
 def _thinned(points: Any) -> list[list[float]]:
-    """Return at most 200 finite points, shape (n, 2), for a plot 300 pixels wide, including the last one."""
+    """Return at most 200 finite points, including the last one, shape (n, 2), for a plot 300 pixels wide."""
     points = points[np.isfinite(points).all(axis=1)]
     step = -(-len(points) // 200)
     return [[float(f"{value:.5g}") for value in point] for point in points[::-1][::step][::-1]] if step else []

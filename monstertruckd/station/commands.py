@@ -33,7 +33,7 @@ class _Command(BaseModel):
 
 
 class Asked(_Command):
-    """Command that reports its outcome to the browser."""
+    """Command whose outcome is reported to the browser."""
 
     id: Id
 
@@ -54,7 +54,7 @@ class LookAtFleet(_Command):
 
 
 class EchoRequest(_Command):
-    """Request an immediate answer: the browser measures the latency to the station."""
+    """Request an immediate answer, from which the browser measures the latency to the station."""
 
     do: Literal["ping"]
     at: Number
@@ -62,7 +62,7 @@ class EchoRequest(_Command):
 
 
 class Heartbeat(_Command):
-    """One heartbeat of the stick, keys or gamepad, with the current input."""
+    """One heartbeat from the stick, keys or gamepad, with the current input."""
 
     do: Literal["drive"]
     heard: Number
@@ -83,7 +83,7 @@ class Heartbeat(_Command):
 
 
 class GiveOrder(Asked):
-    """Arm, disarm, stop, emergency stop or its reset."""
+    """Arm, disarm, stop, emergency-stop or reset the emergency stop."""
 
     do: Literal["order"]
     order: Order
@@ -141,7 +141,7 @@ class Track(Asked):
 
 
 class TrackFile(Asked):
-    """Follow the path of a file, in the map frame."""
+    """Follow the path in a file, in the map frame."""
 
     do: Literal["track_file"]
     name: Annotated[str, Field(max_length=128)]
@@ -223,7 +223,7 @@ class ListRecordings(Asked):
 
 
 class DeleteRecording(Asked):
-    """Delete a recording on the robot."""
+    """Delete a recording from the robot."""
 
     do: Literal["delete_recording"]
     name: Annotated[str, Field(max_length=128)]
@@ -239,7 +239,7 @@ class ReplayRecording(Asked):
 
 
 class InjectFault(Asked):
-    """Start or end a fault of an emulated robot's device."""
+    """Start or end a fault in a device of an emulated robot."""
 
     do: Literal["fault"]
     device: Annotated[str, Field(max_length=64)]
@@ -274,7 +274,7 @@ class ListNumbers(Asked):
 
 
 class PlotNumbers(Asked):
-    """Send the values of these numbers from now on, instead of the previous selection."""
+    """Send the values of these numbers instead of the previous selection."""
 
     do: Literal["plot"]
     set: Id
@@ -334,7 +334,7 @@ LOOKING: Final = Watch | LookAtFleet | EchoRequest | ControlReplay | ListNumbers
 
 
 def needed(command: AnyCommand) -> AccessRole:
-    """Return the role required for a command: every user may watch and stop."""
+    """Return the role required for a command; every user may watch and stop."""
     if isinstance(command, GiveOrder) and command.order in UNCONDITIONAL:
         return AccessRole.OBSERVER
     if isinstance(command, LOOKING | ListSettings | ListRecordings):
@@ -343,7 +343,7 @@ def needed(command: AnyCommand) -> AccessRole:
 
 
 def parse(data: str) -> AnyCommand:
-    """Parse the command of one message.
+    """Parse the command in one message.
 
     Raises:
         InputError: the message is not a command; the text names the first wrong field.

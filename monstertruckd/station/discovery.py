@@ -23,7 +23,7 @@ MOST_ROBOTS: Final = 64
 
 
 class Discovery:
-    """Watches one endpoint for robots; waits for an absent endpoint.
+    """Watches one endpoint for robots; if the endpoint is absent, waits for it.
 
     Args:
         endpoint: endpoint of a Zenoh router or a robot.
@@ -39,7 +39,7 @@ class Discovery:
         self._retry = 1.0  # time between connection attempts to a router, and timeout of each (s)
 
     async def run(self) -> None:
-        """Watch until cancelled; logs the reason for a failed connection once."""
+        """Watch until cancelled; log the reason for a failed connection once."""
         said = ""
         while True:
             try:

@@ -1,4 +1,4 @@
-"""Download of a robot's recordings to a browser, which resumes an interrupted download by itself."""
+"""Downloads of a robot's recordings to a browser, which resumes interrupted downloads by itself."""
 
 import base64
 import logging
@@ -34,11 +34,11 @@ async def download(
 ) -> web.StreamResponse:
     """Answer a request for a recording; the robot limits the rate.
 
-    A ``Range`` of the form ``bytes=N-`` returns the bytes from N (RFC 9110, 14.2); other ranges are ignored. A
-    download stops when its user no longer ``may`` have it.
+    A ``Range`` of the form ``bytes=N-`` returns the bytes from N (RFC 9110, 14.2); other ranges are ignored. A download
+    stops when its user no longer ``may`` have it.
 
     Raises:
-        web.HTTPException: the robot refuses or is absent, or the range starts behind the end.
+        web.HTTPException: the robot refuses or is absent, or the range starts beyond the end.
     """
     async with _session(address, user, clock) as truck:
         offset = _begin(request.headers.get("Range"))
@@ -90,9 +90,9 @@ async def _stream(
     size: int,
     may: Callable[[], bool],
 ) -> None:
-    """Forward chunks up to the promised size; a failed chunk breaks the connection, so that the browser notices.
+    """Forward chunks up to the promised size; a failed chunk breaks the connection, so the browser notices.
 
-    An empty chunk does the same: the file became shorter, and further requests would never end.
+    An empty chunk also breaks the connection: the file has become shorter, and further requests would never end.
     """
     while True:
         data = base64.b64decode(answer["data"])[: size - at]

@@ -1,4 +1,4 @@
-"""Emulated robot in the station's process: faults of its devices, obstacles in its world."""
+"""Emulated robot in the station's process: faults in its devices, obstacles in its world."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
@@ -29,7 +29,7 @@ class EmulatedWorld:
         self._obstacles: list[tuple[float, float]] = []
 
     def state(self) -> dict[str, Any]:
-        """Return current faults by device, and positions of obstacles (m)."""
+        """Return the current faults by device, and the positions of the obstacles (m)."""
         return {"faults": self._faults, "obstacles": self._obstacles}
 
     def inject(self, device: str, fault: DeviceFault) -> None:

@@ -1,4 +1,4 @@
-"""Messages of one robot, encoded once for all browsers that watch it."""
+"""Messages from one robot, encoded once for all browsers that watch it."""
 
 import asyncio
 import logging
@@ -87,7 +87,7 @@ SHOWN: Final[tuple[Shown[Any], ...]] = (
 
 @dataclass
 class MapStore:
-    """Latest full map of a robot and the tiles changed since; browsers fetch the full map by URL."""
+    """Latest full map of a robot and the tiles changed since then; browsers fetch the full map by URL."""
 
     version: int = 0
     grid: Grid | None = None
@@ -95,14 +95,14 @@ class MapStore:
     _packed: bytes | None = None
 
     def take(self, grid: Grid) -> str:
-        """Store a full map; returns the frame that announces it."""
+        """Store a full map; return the frame that announces it."""
         self.version += 1
         self.grid, self._packed = grid, None
         self.tiles.clear()
         return frames.text("map", version=self.version, **frames.grid_head(grid))
 
     def change(self, part: Grid) -> tuple[Place, bytes]:
-        """Store a changed tile; returns its place and its frame."""
+        """Store a changed tile; return its place and its frame."""
         place, frame = (part.origin.x, part.origin.y), frames.tile(part, self.version)
         if place in self.tiles or len(self.tiles) < MOST_TILES:
             self.tiles[place] = frame
@@ -122,7 +122,7 @@ class MapStore:
 
 
 class RobotFeed:
-    """Follows one robot for all browsers; waits for a robot that is absent or disappears.
+    """Follows one robot for all browsers; waits while the robot is absent.
 
     Args:
         address: address of the robot.
@@ -155,7 +155,7 @@ class RobotFeed:
     # Browsers
 
     def attach(self, viewer: Viewer) -> None:
-        """Show this robot in a browser, starting with everything known about it."""
+        """Show this robot in a browser, starting with everything known about the robot."""
         self._viewers.add(viewer)
         self._watched.set()
         self._send_all(viewer)
@@ -211,7 +211,7 @@ class RobotFeed:
             await asyncio.wait(jobs)
 
     async def _ask(self, client: TruckClient) -> None:
-        """Measure the round trip; query the facts of a robot that appears."""
+        """Measure the round-trip time; query the facts of a robot that appears."""
         self._known = False
         while True:
             sent = self._clock.now()
@@ -241,7 +241,7 @@ class RobotFeed:
             self._send_all(viewer)
 
     async def _learn(self, client: TruckClient) -> bool:
-        """Query the robot's facts; returns whether it answered."""
+        """Query the robot's facts; return whether it answered."""
         try:
             self._facts = frames.facts(await client.call("config"), await client.call("versions"))
         except (TruckError, KeyError, TypeError, AttributeError) as error:  # the robot runs another release

@@ -20,7 +20,7 @@ FLEET_PERIOD: Final = 0.5
 
 
 class RobotSnapshot:
-    """Latest pose and battery of one robot, decoded at every check, not at every message.
+    """Latest pose and battery state of one robot, decoded at every check, not at every message.
 
     Args:
         client: session with the robot.
@@ -59,12 +59,12 @@ class RobotSnapshot:
         return (now - self._changes[name][1]) / SECOND > 2.0
 
     def close(self) -> None:
-        """End the subscriptions; the session may be gone already."""
+        """End the subscriptions; the session may already be closed."""
         self._stack.close()
 
 
 class FleetBoard:
-    """Creates one frame of all robots for all browsers that watch the fleet; without any, it subscribes to nothing.
+    """Creates one frame with all robots for the browsers that watch the fleet; subscribes only while a browser watches.
 
     Args:
         feeds: feeds of all robots by name; more may be added.

@@ -1,8 +1,9 @@
 """One robot for the Foxglove app: its topics, configuration and orders over Foxglove's WebSocket protocol.
 
-The server forwards each topic's bytes unchanged, with its schema, and subscribes at the robot only while a client
-subscribes. Unlike the page's WebSocket, this one cannot see which site's page opened a connection, so any page open in
-a browser on this machine may use it. Driving, and orders other than the emergency stop, must therefore be enabled.
+The server forwards each topic's bytes unchanged, with its schema, and subscribes to the robot only while a client is
+subscribed. Unlike the page's WebSocket, this server cannot see which site's page opened a connection, so any page open
+in a browser on this machine may use it. Driving, and orders other than the emergency stop, must therefore be enabled
+explicitly.
 """
 
 import asyncio
@@ -40,7 +41,7 @@ ROBOT_RETRY: Final = 1.0
 
 
 def twist(data: bytes) -> tuple[float, float, float]:
-    """Return forward and left velocity (m/s) and turn rate (rad/s) of a JSON ``geometry_msgs/Twist``.
+    """Return the forward and left velocity (m/s) and the turn rate (rad/s) in a JSON ``geometry_msgs/Twist``.
 
     Raises:
         InputError: ``data`` is not a twist, or not finite.
@@ -71,12 +72,12 @@ def parameters(config: dict[str, Any], prefix: str = "") -> list[Parameter]:
 
 
 class FoxgloveServer:
-    """Serves one robot; waits for a robot that is absent.
+    """Serves one robot; waits while the robot is absent.
 
     Args:
         address: address of the robot.
         clock: clock of the station.
-        port: port on the loopback interface; 0 selects a free one.
+        port: port on the loopback interface; 0 selects a free port.
         drives: whether clients may drive and give all orders; the emergency stop is always allowed.
     """
 
@@ -97,10 +98,10 @@ class FoxgloveServer:
         self._remarks = Remarks(log)
 
     async def run(self, ready: Callable[[], object] = lambda: None) -> None:
-        """Serve until cancelled; calls ``ready`` once clients are answered.
+        """Serve until cancelled; call ``ready`` as soon as clients can connect.
 
         Raises:
-            BusyError: the port is taken.
+            BusyError: the port is in use.
         """
         loop = asyncio.get_running_loop()
         publish = [Capability.ClientPublish] if self._drives else []
@@ -151,12 +152,12 @@ class FoxgloveServer:
     # Subscriptions of clients
 
     def look(self, topic: str) -> None:
-        """Count a client's subscription, and tap the topic."""
+        """Count a client's subscription, and forward the topic."""
         self._looks[topic] += 1
         self._tap(topic)
 
     def leave(self, topic: str) -> None:
-        """Drop a client's subscription; the last one ends the tap."""
+        """Drop a client's subscription; after the last one, the topic is no longer forwarded."""
         self._looks[topic] -= 1
         if self._looks[topic] <= 0:
             del self._looks[topic]
@@ -175,7 +176,7 @@ class FoxgloveServer:
         return [each for each in self._parameters if not names or each.name in names]
 
     def drive(self, data: bytes) -> None:
-        """Turn one message of a teleop panel into one request with a short lease; nothing repeats it."""
+        """Convert one message from a teleop panel to one request with a short lease; nothing repeats the request."""
         try:
             motion = twist(data)
         except InputError as error:

@@ -53,7 +53,7 @@ def refusal(number: int, error: TruckError) -> str:
 
 
 def scan(of: LaserScan, kind: str = "scan") -> bytes:
-    """Return a scan of the lidar that ``kind`` names; payload: uint16 ranges in mm, little-endian, 0 = none."""
+    """Return a scan from the lidar that ``kind`` names; payload: uint16 ranges in mm, little-endian, 0 = no range."""
     # 65.0: maximum range (m), because ranges are sent as millimetres in 16 bits
     ranges = np.where(np.isfinite(of.ranges) & (of.ranges < 65.0), of.ranges * 1000.0, 0.0)
     return binary(
@@ -137,7 +137,7 @@ def grid_head(of: Grid) -> dict[str, Any]:
 
 
 def tile(of: Grid, version: int) -> bytes:
-    """Return a map tile changed since that version; payload: int8 cells, row 0 at the lowest y."""
+    """Return a map tile changed since ``version``; payload: int8 cells, row 0 at the lowest y."""
     return binary("tile", of.cells.tobytes(), version=version, **grid_head(of))
 
 

@@ -1,4 +1,4 @@
-"""Connections to the page's server, with limits during their setup (the TLS handshake), which is expensive."""
+"""Connections to the page's server, with limits during their setup, because the TLS handshake is expensive."""
 
 import asyncio
 import socket
@@ -17,14 +17,14 @@ MOST_OF_NETWORK: Final = 32
 
 
 class WebListener:
-    """Accepts connections to an address while its context lasts.
+    """Accepts connections to an address within its context.
 
     Args:
         host: name or address to listen on.
         port: port to listen on.
         tls: certificate and key; None for plain connections.
         inside: creates the protocol of a connection after its handshake.
-        refused: called with the peer's address and the reason for each closed connection.
+        refused: called with the peer's address and the reason for each refused connection.
     """
 
     def __init__(
@@ -43,10 +43,10 @@ class WebListener:
         self._sockets = ExitStack()
 
     async def __aenter__(self) -> None:
-        """Listen.
+        """Start to listen.
 
         Raises:
-            OSError: the port is taken, or this machine has no such address.
+            OSError: the port is in use, or this machine has no such address.
         """
         loop = asyncio.get_running_loop()
         found = await loop.getaddrinfo(self._host, self._port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
@@ -62,7 +62,7 @@ class WebListener:
             self._begin(self._accept(sock))
 
     async def __aexit__(self, *_: object) -> None:
-        """Stop accepting; abort connections during setup."""
+        """Stop accepting connections; abort those during setup."""
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)

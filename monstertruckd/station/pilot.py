@@ -1,7 +1,7 @@
-"""One browser's control of one robot: a separate source of requests, so that the robot distinguishes two tabs.
+"""One browser's control of one robot: a separate source of requests, so that the robot can distinguish two tabs.
 
-Nothing here repeats a request. Each heartbeat of the browser becomes one request with a short lease, or none if it was
-delayed: an old input does not show the current one.
+Nothing here repeats a request. Each heartbeat from the browser becomes one request with a short lease, or no request if
+it was delayed, because a delayed input is not the current one.
 """
 
 import asyncio
@@ -71,8 +71,8 @@ LONGEST_DRAWN_PATH: Final = 200.0
 class DelayWatch:
     """Detects delayed heartbeats, from the station's latest message that the browser received. Times are in seconds.
 
-    The browser reports the last station time it heard, and the time from then to reading its input. The remaining time
-    is the latency of both messages, so no clock is compared with another.
+    The browser reports the last station time it received, and the time that passed until it read its input. The
+    remaining time is the latency of both messages, so no two clocks are compared.
     """
 
     def __init__(self) -> None:
@@ -92,7 +92,7 @@ class DelayWatch:
 
 
 class Pilot:
-    """Orders and heartbeats of one browser to one robot.
+    """Orders and heartbeats from one browser to one robot.
 
     Args:
         address: address of the robot.
@@ -125,7 +125,7 @@ class Pilot:
         self._answers: set[asyncio.Task[None]] = set()
 
     async def run(self) -> None:
-        """Keep the session until cancelled; wait for a robot that is absent."""
+        """Keep the session open until cancelled; wait while the robot is absent."""
         retry = 1.0  # interval between connection attempts to the robot, and timeout of each (s)
         try:
             while True:
@@ -147,7 +147,7 @@ class Pilot:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     def drive(self, motion: Heartbeat) -> None:
-        """Forward one heartbeat, unless it is late or would have to wait for the robot."""
+        """Forward one heartbeat unless it is late or would have to wait for the robot."""
         now = self._clock.now() / SECOND
         late = self._lateness.late(motion.heard / 1e3, motion.since / 1e3, now)
         if late is not None:
@@ -169,7 +169,7 @@ class Pilot:
             self._viewer.send(frames.text("trouble", text=str(error)))
 
     def ask(self, command: Asked) -> None:
-        """Execute a command, and send its outcome to the browser. An emergency stop has been sent when this returns."""
+        """Execute a command, and send its outcome to the browser; an emergency stop is sent before this returns."""
         stops = isinstance(command, GiveOrder) and command.order in UNCONDITIONAL
         client = self._client or (self._spare() if stops else None)
         if client is None:
@@ -219,7 +219,7 @@ def _call(client: TruckClient, command: Asked, clock: Clock) -> Coroutine[Any, A
 
 
 def _other_call(client: TruckClient, command: Asked) -> Coroutine[Any, Any, Any]:
-    """Return the call of a command that moves nothing."""
+    """Return the call for a command that moves nothing."""
     match command:
         case AskToDrive():
             return client.ask_to_drive()
@@ -257,11 +257,11 @@ async def _mission(client: TruckClient, command: DoMission) -> dict[str, Any]:
 
 
 def read_mission(text: str) -> Mission:
-    """Return the mission in a file's text, or a mission that drives to each waypoint in it.
+    """Return the mission in a file's text, or a mission that drives to each waypoint in the text.
 
     Raises:
-        InputError: the text is not a mission, or has aliases (a few lines of them can expand to gigabytes); names the
-            first mistake.
+        InputError: the text is not a mission, or has aliases (a few lines of them can expand to gigabytes); the message
+            names the first mistake.
     """
     if has_waypoints(text):
         return mission_from(text, FilePath("mission.yaml"))
@@ -276,10 +276,10 @@ def read_mission(text: str) -> Mission:
 
 
 def drawn_path(points: Sequence[tuple[float, float]]) -> Path:
-    """Convert a drawn line to a path in map (m), driven forward: resample it to 5 cm and smooth it.
+    """Convert a drawn line to a path in the map (m), driven forward: resample it to 5 cm and smooth it.
 
     Raises:
-        InputError: the line is too short to be driven, or too long.
+        InputError: the line is too short or too long to be driven.
     """
     line = np.array(points)
     steps = np.hypot(*np.diff(line, axis=0).T)

@@ -1,4 +1,4 @@
-"""Numbers in messages over time, for the plots of the page: their names, and their values at every tick."""
+"""Numbers in messages over time, for the plots on the page: their names, and their values at every tick."""
 
 import types
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -26,7 +26,7 @@ HEADER: Final = frozenset(Message.model_fields)
 def numbers() -> Mapping[str, str]:
     """Return the meaning of every number by its name ``topic:field.field``; "" if it has none.
 
-    Numbers in lists are omitted, because their count changes.
+    Numbers in lists are omitted because the length of a list varies.
     """
     return {
         f"{topic.name}:{path}": meaning
@@ -49,7 +49,7 @@ def _numbers_of(model: type[BaseModel], prefix: str) -> Iterator[tuple[str, str]
 
 
 def _plain_type(annotation: Any) -> Any:
-    """Return the type without its constraints and without None."""
+    """Return the type without constraints and without None."""
     if get_origin(annotation) is Annotated:
         return _plain_type(get_args(annotation)[0])
     if get_origin(annotation) in UNIONS:
@@ -78,10 +78,10 @@ def value_in(message: Message, path: str) -> float | None:
 
 
 class Subscriptions:
-    """Latest messages of the plotted topics; a topic is subscribed to at its first use.
+    """Latest messages of the plotted topics; a topic is subscribed to when it is first used.
 
     Args:
-        subscribe: opens a mailbox of a topic.
+        subscribe: opens a mailbox for a topic.
         stack: closes all mailboxes.
     """
 
@@ -101,7 +101,7 @@ class Sampler:
     """Sends browsers the values that they plot.
 
     Args:
-        newest: returns the latest message of a topic.
+        newest: function that returns the latest message of a topic.
     """
 
     def __init__(self, newest: Callable[[str], Message | None]) -> None:
@@ -109,7 +109,7 @@ class Sampler:
         self._taken: dict[str, Message] = {}
 
     def sample(self, viewers: Iterable[Viewer]) -> None:
-        """Send the values since the last call: one for each plotted number, None without a new message."""
+        """Send the values since the last call: one for each plotted number, None if there is no new message."""
         plotting = [viewer for viewer in viewers if viewer.plotted]
         wanted = {name.partition(":")[0] for viewer in plotting for name in viewer.plotted}
         found = ((topic, self._newest(topic)) for topic in sorted(wanted))

@@ -18,9 +18,9 @@ async def fetch_recording(
     The robot limits the rate.
 
     Args:
-        truck: the robot.
+        truck: session with the robot.
         name: name of the recording.
-        to: file; created with the first bytes.
+        to: file; created when the first bytes arrive.
         progress: called with the fraction fetched, 0..1.
         most: maximum size (bytes); None for no limit.
 
@@ -57,7 +57,7 @@ def _read(file: Path, at: int) -> bytes:
 
 
 def put(file: Path, at: int, data: bytes) -> None:
-    """Write at an offset; an earlier, abandoned write may still be running."""
+    """Write at an offset; an earlier write that was abandoned may still be running."""
     file.touch()
     with file.open("r+b") as part:
         part.seek(at)

@@ -1,4 +1,4 @@
-"""Log lines about clients, limited per address, so that a client sending rubbish cannot fill the disk."""
+"""Log lines about clients, limited per address, so that a client that sends garbage cannot fill the disk."""
 
 import asyncio
 import logging
@@ -9,19 +9,19 @@ OTHERS: Final = "other addresses"
 
 
 def printable(text: str, longest: int = 300) -> str:
-    """Return one line that a terminal shows unchanged: control characters become escapes, the rest is cut off."""
+    """Return one line that a terminal shows unchanged: control characters are escaped, excess text is cut off."""
     short = text if len(text) <= longest else f"{text[:longest]}..."
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in short)
 
 
 class Remarks:
-    """Writes log lines with a limit per address; use it on the event loop.
+    """Writes log lines with a limit per address; must be used on the event loop.
 
     Args:
         log: destination of the lines.
         window: time over which lines are counted (s).
-        burst: maximum number of lines per address in that time; further lines are counted, and reported at its end.
-        most_peers: maximum number of addresses counted separately in that time; all others share one count.
+        burst: maximum number of lines per address in the window; further lines are counted and reported at its end.
+        most_peers: maximum number of addresses counted separately in the window; all others share one count.
     """
 
     def __init__(self, log: logging.Logger, *, window: float = 60.0, burst: int = 20, most_peers: int = 32) -> None:
@@ -31,7 +31,7 @@ class Remarks:
         self._timer: asyncio.TimerHandle | None = None
 
     def add(self, peer: str | None, text: str, level: int = logging.WARNING) -> None:
-        """Write ``text``, unless ``peer`` has already caused many lines."""
+        """Write ``text`` unless ``peer`` has already caused too many lines."""
         known = peer or "?"
         if known not in self._counts and len(self._counts) >= self._most_peers:
             known = OTHERS

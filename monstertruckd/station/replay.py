@@ -1,4 +1,4 @@
-"""Replay of a recording on the page, with a time bar: the same frames as for a robot, read from a log."""
+"""Replay of a recording on the page, with a time bar: browsers get the same frames as from a robot, read from a log."""
 
 import bisect
 import logging
@@ -35,11 +35,11 @@ class RecordedLog(Iterable[Any], Protocol):
     """A log file: iterates over its messages."""
 
     def config(self) -> dict[str, Any]:
-        """Return the robot's configuration at the recording."""
+        """Return the robot's configuration at the time of the recording."""
 
     @property
     def fault(self) -> str | None:
-        """Fault found by an iteration to the end, as text that follows the log's name; None for a sound log."""
+        """Fault found by iterating to the end, as text that follows the log's name; None for an intact log."""
 
 
 LogOpener = Callable[[Path], RecordedLog]
@@ -70,7 +70,7 @@ class RecordedTopic:
         return next(self.up_to(at), None)
 
     def last(self, at: int) -> Message | None:
-        """Return the latest message up to ``at``, the same object until there is a later one; None before the first."""
+        """Return the latest message up to ``at``, or None; the same object until there is a later message."""
         place = bisect.bisect_right(self.times, at) - 1
         if place != self._last[0]:
             self._last = place, next(_decoded(self.messages[place : place + 1]), None) if place >= 0 else None
@@ -87,16 +87,16 @@ def _decoded(rows: Iterable[Recorded]) -> Iterator[Message]:
 
 
 class ReplayFeed:
-    """Recording that all its browsers see at the same time.
+    """Recording shown to all its browsers at the same time.
 
     Args:
         name: name in the page's list of robots.
         file: log file.
-        open_log: opens logs.
+        open_log: function that opens logs.
         clock: clock of the station.
 
     Raises:
-        InputError: the file is not a log, holds nothing to show, or is too large.
+        InputError: the file is not a log, contains nothing to show, or is too large.
     """
 
     def __init__(self, name: str, file: Path, open_log: LogOpener, clock: Clock) -> None:
@@ -146,7 +146,7 @@ class ReplayFeed:
 
     @property
     def watched(self) -> bool:
-        """Whether a browser shows the recording."""
+        """Whether any browser shows the recording."""
         return bool(self._viewers)
 
     def attach(self, viewer: Viewer) -> None:
@@ -179,10 +179,10 @@ class ReplayFeed:
         return self._begin <= stamp <= self._end
 
     def show_moment(self, stamp: int) -> None:
-        """Show the moment of a stamp of the robot's clock (ns), and stay there.
+        """Show the moment of a stamp of the robot's clock (ns), and pause there.
 
         Raises:
-            InputError: the recording does not hold it.
+            InputError: the recording does not contain this moment.
         """
         if not self.holds(stamp):
             raise InputError(f"{self.name}: does not contain this time")

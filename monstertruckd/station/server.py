@@ -96,7 +96,7 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Listening address of the page; beyond this machine only with TLS and users who log in.
+    """Listening address of the page; TLS and users who log in are required for an address other than loopback.
 
     Raises:
         NotPermittedError: ``host`` is not a loopback address, and the certificate or the users are missing.
@@ -128,7 +128,7 @@ class Place:
 
     @property
     def names(self) -> frozenset[str]:
-        """Accepted values of the Host header; requests under other names that resolve here are refused."""
+        """Accepted values of the Host header; requests under other names that resolve to this machine are refused."""
         own = f"[{self.host}]" if ":" in self.host else self.host
         names = {name.lower() for name in (own, *self.aliases, "localhost", "127.0.0.1", "[::1]")}
         usual = names if self.port == USUAL_PORTS[self.scheme] else ()
@@ -136,7 +136,7 @@ class Place:
 
     @property
     def origins(self) -> frozenset[str]:
-        """Accepted values of the Origin header: another scheme is another page."""
+        """Accepted values of the Origin header; a different scheme means a different page."""
         return frozenset(f"{self.scheme}://{name}" for name in self.names)
 
 
@@ -148,7 +148,7 @@ class Station:
         clock: clock of the station.
         place: address to listen on.
         routers: endpoints whose robots are shown as they appear.
-        open_log: opens recordings for replay; None disables replay.
+        open_log: function that opens recordings for replay; None disables replay.
         emulated: receives faults and obstacles of an emulated robot; None if this program emulates no robot.
         calibrator: the calibration wizards; None disables calibration.
     """
@@ -190,10 +190,10 @@ class Station:
         self._fetching = asyncio.Lock()
 
     async def run(self, ready: Callable[[], object] = lambda: None) -> None:
-        """Serve until cancelled; calls ``ready`` once browsers are answered.
+        """Serve until cancelled; call ``ready`` as soon as browsers can connect.
 
         Raises:
-            BusyError: the port is taken.
+            BusyError: the port is in use.
         """
         http = logging.getLogger(f"{__name__}.http")
         http.addFilter(self._refuse_rubbish)
@@ -246,7 +246,7 @@ class Station:
                     task.add_done_callback(self._closing.discard)
 
     def _close_crowds(self, server: web.Server) -> None:
-        """Close excess connections of one network, even before a login, so that it cannot use all file descriptors."""
+        """Close excess connections from one network, even before a login, to protect the file descriptors."""
         of_peer: dict[str, int] = {}
         for connection in server.connections:  # the oldest first
             peer = _peer(connection)
@@ -275,12 +275,12 @@ class Station:
         return name
 
     def _drop_replay(self, name: str) -> None:
-        """Show a recording no longer."""
+        """Stop showing a recording."""
         self._following.pop(self.replays.pop(name)).cancel()
 
     @property
     def names(self) -> list[str]:
-        """Names that browsers can watch: robots, then recordings."""
+        """Names that browsers can watch: robots first, then recordings."""
         return [*self.feeds, *self.replays]
 
     async def replay(
@@ -289,8 +289,8 @@ class Station:
         """Fetch a recording and offer it in every browser, at a moment (ns, robot's clock) if given; return its name.
 
         Raises:
-            InputError: the name is invalid, the recording cannot be shown or does not hold the moment, or too many are
-                shown already.
+            InputError: the name is invalid, the recording cannot be shown or does not contain the moment, or too many
+                recordings are already shown.
             TruckError: the robot refuses, or is absent.
         """
         title = f"{address.name} {name.removesuffix('.mcap')}"
@@ -379,7 +379,7 @@ class Station:
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Refuse requests that other sites make a browser send."""
+        """Refuse requests that other sites cause a browser to send."""
         if request.host not in self.place.names:
             raise self._refused(request, f"host {request.host!r} is not a name of this station")
         origin = request.headers.get("Origin")
@@ -409,7 +409,7 @@ class Station:
         return web.HTTPForbidden(text=why, headers=HEADERS)
 
     def _refuse_rubbish(self, record: logging.LogRecord) -> bool:
-        """Log filter for aiohttp: replace its line on a malformed HTTP request by a short one; pass all other lines."""
+        """Log filter for aiohttp: shorten its line about a malformed HTTP request; pass all other lines."""
         fault = record.exc_info[1] if isinstance(record.exc_info, tuple) else None
         if not isinstance(fault, HttpProcessingError):
             return True
@@ -525,7 +525,7 @@ class _Pace:
         self._left, self._at = MESSAGES, self._clock()
 
     async def keep(self) -> None:
-        """Wait after a message if there were too many."""
+        """Wait after a message if there have been too many."""
         now = self._clock()
         self._left, self._at = min(self._left + (now - self._at) * MESSAGES, MESSAGES) - 1.0, now
         if self._left < 0.0:
@@ -552,7 +552,7 @@ class _Browser:
         station.show_emulated((self.viewer,))
 
     def take(self, data: str) -> None:
-        """Execute the command of one message.
+        """Execute the command in one message.
 
         Raises:
             InputError: the message is not a command, or names an unknown robot.
@@ -585,7 +585,7 @@ class _Browser:
                 self._ask_robot(command)
 
     def _do(self, command: InjectFault | PlaceObstacle | ListNumbers | PlotNumbers) -> None:
-        """Execute a command for the station itself, and answer it."""
+        """Execute a command to the station itself, and answer it."""
         value: dict[str, Any] = {}
         try:
             match command:
@@ -634,7 +634,7 @@ class _Browser:
         self._begin(self._replay(command))
 
     def _answered(self, command: commands.AnyCommand | commands.Asked, error: TruckError) -> TruckError:
-        """Report the error as the outcome of a command that has one, and return it."""
+        """Report the error as the outcome of a command, if the command has one; return the error."""
         if isinstance(command, commands.Asked):
             self.viewer.send(frames.refusal(command.id, error))
         return error
@@ -685,7 +685,7 @@ class _Browser:
             self._calibration = Calibration(feed.address, program, self._clock, calibrator, self.viewer)
 
     def _show_replay(self, replay: ReplayFeed) -> None:
-        """Show a recording; keep or open the session with the robot, so that its emergency stop is available."""
+        """Show a recording; keep or open the session with the robot, so that its emergency stop remains available."""
         if self._feed is not None:
             self._feed.detach(self.viewer)
         self.viewer.forget()
@@ -726,7 +726,7 @@ def _peer(connection: web.RequestHandler) -> str:
 
 
 def _while_replaying(command: commands.AnyCommand) -> bool:
-    """Return whether a command is executed while a recording is shown."""
+    """Return whether a command may be executed while a recording is shown."""
     if isinstance(command, commands.GiveOrder):
         return command.order in UNCONDITIONAL
     return isinstance(command, commands.LOOKING)
@@ -755,7 +755,7 @@ def _page_file(name: str) -> web.Response:
 
 
 def _strings(language: str = LANGUAGE) -> bytes:
-    """Return all texts of the page by key; reasons have the robot's texts unless the table has better ones."""
+    """Return all texts of the page by key; a reason has the robot's text unless the table has a better one."""
     table = {f"reason.{reason.value}": reason.text for reason in Reason}
     table |= json.loads((PAGE / "strings" / f"{language}.json").read_text(encoding="utf-8"))
     return json.dumps(table).encode()

@@ -1,4 +1,4 @@
-"""Users of a page served beyond this machine: names, roles, and passwords as scrypt hashes (RFC 7914)."""
+"""Users of a page served to other machines: names, roles, and passwords as scrypt hashes (RFC 7914)."""
 
 import asyncio
 import base64
@@ -58,11 +58,11 @@ class StationUsers:
     """Current users in a file.
 
     Args:
-        file: file to read.
+        file: file with the users.
 
     Raises:
         NotFoundError: the file does not exist.
-        NotPermittedError: others may read the file.
+        NotPermittedError: other accounts may read the file.
         InputError: the file is not a users file.
     """
 
@@ -80,10 +80,10 @@ class StationUsers:
         self._hashing = asyncio.Semaphore(2)  # maximum number of concurrent hash computations
 
     async def refresh(self) -> bool:
-        """Read the file again if it has changed; returns whether the users have changed.
+        """Read the file again if it has changed; return whether the users have changed.
 
-        A file that cannot be read, or holds no user, is reported and retried, and the users stay unchanged: a slip in
-        an editor must not take the emergency stop from any user.
+        If the file cannot be read or contains no user, the error is reported, the read is retried and the users stay
+        unchanged: a mistake in an editor must not take the emergency stop away from any user.
         """
         version = await in_thread(lambda: _version(self._file))
         if version == self._version:

@@ -1,1 +1,1 @@
-"""Tools outside the daemon: one package for each job, and `cli`, whose commands open them."""
+"""Tools outside the daemon: one package for each job, and `cli`, the commands that start them."""

@@ -1,1 +1,1 @@
-"""Calibration of a truck: guided wizards, and the dated file of their results."""
+"""Calibration of a truck: guided wizards, and dated files with their results."""

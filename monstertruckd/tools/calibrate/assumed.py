@@ -83,21 +83,21 @@ class AssumedErrors(Schema):
     """
 
     def beam_angle(self, tape: float, apart: float) -> float:
-        """Return the error of a beam's angle to the body (rad), by two heights and the compass.
+        """Return the error of a beam's angle relative to the body (rad), measured by two taped heights and the compass.
 
         Args:
             tape: error of a taped height (m).
-            apart: distance of the heights along the beam (m).
+            apart: distance between the two heights along the beam (m).
         """
         heights = math.hypot(tape * math.sqrt(2), self.tape_floor * tape)
         return math.hypot(heights / apart, self.compass_tilt)
 
     def turn_of_leg(self, sigma: float, distance: float) -> float:
-        """Return the error of a turn (rad) that is measured to ``sigma`` (rad) over a distance (m)."""
+        """Return the error of a leg's turn (rad): ``sigma`` (rad), combined with wheel slip over ``distance`` (m)."""
         return math.hypot(sigma, self.turn_slip * math.sqrt(distance))
 
     def place_of_leg(self, sigma: float, distance: float) -> float:
-        """Return the error of a leg's end (m) that is measured to ``sigma`` (m) over a distance (m)."""
+        """Return the error of a leg's end point (m): ``sigma`` (m), combined with drift over ``distance`` (m)."""
         return math.hypot(sigma, self.leg_distance * distance, self.leg_direction * distance)
 
 

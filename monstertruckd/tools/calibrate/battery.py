@@ -1,4 +1,4 @@
-"""Scale of the battery voltage from a multimeter, and its offset if the readings cover different voltages.
+"""Scale of the battery voltage, measured with a multimeter, and its offset if the readings span different voltages.
 
 ``volts = gain * raw + offset``, where ``raw`` is the input's reading with gain 1 and offset 0. A pack changes by 4 V
 between full and empty, so a second reading is usually taken days later: readings are saved with the result and reused.
@@ -31,7 +31,7 @@ EVEN: Final = math.sqrt(3)
 
 @dataclass(frozen=True, slots=True)
 class MeterReading:
-    """One pack voltage, measured by the input and by the meter."""
+    """One pack voltage, measured by both the input and the multimeter."""
 
     raw: float
     volts: float
@@ -41,7 +41,7 @@ class MeterReading:
 
 @dataclass(frozen=True, slots=True)
 class BatteryWizard:
-    """Wizard with one or more readings of a multimeter."""
+    """Wizard that compares the input with one or more multimeter readings."""
 
     name: ClassVar[WizardName] = "battery"
     doc: ClassVar[str] = "scale of the battery voltage from a multimeter; its offset if the readings cover two voltages"
@@ -56,7 +56,7 @@ class BatteryWizard:
 
     @classmethod
     def of(cls, meter_error: float, meter_digits: float, fresh: bool) -> Self:
-        """Create it from the command's options: the proportional and constant error of the meter."""
+        """Create a wizard from the command's options: the proportional and constant error of the meter."""
         return cls(meter_error, meter_digits, fresh=fresh)
 
     async def __call__(self, context: WizardContext) -> Result:
@@ -99,7 +99,7 @@ class BatteryWizard:
 
     @staticmethod
     def _step(context: WizardContext) -> float:
-        """Rounding of one raw reading, V; 0 if the converter's resolution is fine enough."""
+        """Resolution of one raw reading (V); 0 if the converter's resolution is fine enough."""
         steering = context.config.devices.steering
         coarse = (
             context.config.monitors.battery is None and steering is not None and steering.driver.battery is not None
@@ -145,8 +145,8 @@ class BatteryWizard:
     def scale(self, readings: list[MeterReading]) -> tuple[Interval, Interval]:
         """Fit gain and offset by least squares.
 
-        The meter's proportional error is common to all readings, its digit error is independent. Errors with only a
-        known bound are assumed to be uniform within it.
+        The meter's proportional error is common to all readings; its digit error is independent. Errors with only a
+        known bound are assumed to be uniformly distributed within it.
 
         Raises:
             InputError: no line fits every reading within its bounds.
@@ -177,7 +177,7 @@ class BatteryWizard:
     def _check(self, raw: Array, volts: Array, noise: Array) -> None:
         """Raise InputError if no gain and offset explain all readings.
 
-        Each reading leaves a range of gains for an offset.
+        For a given offset, each reading allows a range of gains.
         """
         bounds = self.meter_share * volts + self.meter_digits + noise
         offsets = np.linspace(-EARTHING, EARTHING, 201)[:, None]
@@ -190,10 +190,10 @@ class BatteryWizard:
 
 
 def check_input(reading: MeterReading, gain: float) -> None:
-    """Refuse readings that cannot come from the battery.
+    """Reject a reading that cannot come from the battery.
 
     Raises:
-        InputError: it reads less than half or more than twice the meter's reading.
+        InputError: the input reads less than half or more than twice the meter's voltage.
     """
     shown = reading.raw * gain
     if not volts_near(shown, reading.volts):
@@ -204,5 +204,5 @@ def check_input(reading: MeterReading, gain: float) -> None:
 
 
 def volts_near(shown: float, volts: float) -> bool:
-    """Whether two voltages may be of the same pack, if the divider is wrong by a factor of two at most."""
+    """Return whether two voltages may belong to the same pack if the divider is wrong by at most a factor of two."""
     return volts / 2 < shown < 2 * volts

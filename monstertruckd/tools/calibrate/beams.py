@@ -1,4 +1,4 @@
-"""Ranges of several scans, by beam."""
+"""Ranges of several scans, arranged by beam."""
 
 from collections.abc import Sequence
 
@@ -10,26 +10,26 @@ from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
 
 
 def bearings_of(scan: LaserScan) -> Array:
-    """Bearings of a scan's beams, shape (n,), rad."""
+    """Bearings of a scan's beams (rad), shape (n,)."""
     return scan.start_angle + scan.angle_increment * np.arange(len(scan.ranges), dtype=np.float64)
 
 
 def stacked_ranges(scans: Sequence[LaserScan], missing: float) -> Array:
-    """Ranges along the beams of the first scan, m.
+    """Ranges along the beams of the first scan (m).
 
     Args:
-        scans: at least one; their numbers of beams may differ.
+        scans: at least one scan; the number of beams may differ between scans.
         missing: value for a beam without a range.
 
     Returns:
-        Shape (number of scans, beams of the first one).
+        Shape (number of scans, number of beams in the first scan).
     """
     bearings = bearings_of(scans[0])
     return np.array([_along(bearings, scan, missing) for scan in scans])
 
 
 def _along(bearings: Array, scan: LaserScan, missing: float) -> Array:
-    """Ranges of the beams closest to the bearings (n,), m."""
+    """Ranges (m) of the beams closest to the given bearings, shape (n,)."""
     measured = np.where(scan.codes == VALID_BEAM, scan.ranges, missing)
     beams = nearest_beams(bearings, scan.start_angle, scan.angle_increment)
     return np.append(measured, missing)[np.minimum(beams, len(measured))]

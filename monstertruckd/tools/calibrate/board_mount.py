@@ -1,10 +1,10 @@
-"""Camera mount from a board seen by camera and lidar: the lidar's points on it lie in the plane seen by the camera.
+"""Camera mount from a board visible to camera and lidar: lidar points on the board lie in the plane seen by the camera.
 
 Zhang and Pless, "Extrinsic calibration of a camera and laser range finder (improves camera calibration)", IROS 2004: in
 every view the camera measures the plane of the board, and the lidar's points on the board must lie in it. A view gives
-two equations: the distance of the line's middle from the plane, and the angle between line and plane. At least six
+two equations: the distance of the line's midpoint from the plane, and the angle between line and plane. At least six
 views with different tilts determine the six parameters of the mount. The fit also estimates the true size of the board
-and the lidar's range excess.
+and the lidar's range bias.
 """
 
 import math
@@ -35,7 +35,7 @@ REACH: Final = np.array((0.5, 0.5, 0.5, 0.8, 0.8, 0.8))
 
 
 class LidarPlace(NamedTuple):
-    """Mount of the lidar on the body, as configured."""
+    """Configured mount of the lidar on the body."""
 
     place: Array
     """Position, shape (3,), m."""
@@ -44,14 +44,14 @@ class LidarPlace(NamedTuple):
 
     @classmethod
     def of(cls, mount: Mount, pitch: float = 0.0, roll: float = 0.0) -> "LidarPlace":
-        """Mount with its joints at ``pitch`` and ``roll``, rad."""
+        """Return the mount with its joints at ``pitch`` and ``roll`` (rad)."""
         place = np.array((mount.x, mount.y, mount.z))
         return cls(place, rotation(0.0, pitch, roll) @ rotation(mount.yaw, mount.pitch, mount.roll))
 
 
 @dataclass(frozen=True, slots=True)
 class BoardLine:
-    """A board seen by camera and lidar."""
+    """A line of lidar points on a board that the camera also sees."""
 
     pose: BoardPose
     """Pose of the board in front of the camera"""
@@ -112,24 +112,24 @@ def line_on_board(
 
 
 def directions(angles: Array) -> Array:
-    """Unit vectors of beams in the lidar's axes, shape (n, 3)."""
+    """Unit vectors along the beams in the lidar frame, shape (n, 3)."""
     return np.column_stack((np.cos(angles), np.sin(angles), np.zeros(angles.size)))
 
 
 def in_camera(points: Array, mount: Array, lidar: LidarPlace) -> Array:
-    """Transform lidar points to the camera's axes, m; input and result (n, 3)."""
+    """Transform lidar points (m) to the camera frame; input and result have shape (n, 3)."""
     x, y, z, yaw, pitch, roll = mount.tolist()
     on_body = points @ lidar.axes.T + lidar.place
     return np.asarray((on_body - (x, y, z)) @ camera_axes(yaw, pitch, roll))
 
 
 def in_board(points: Array, pose: BoardPose, mount: Array, lidar: LidarPlace) -> Array:
-    """Transform lidar points to the board's axes (right, down, behind), m; input and result (n, 3)."""
+    """Transform lidar points (m) to the board frame (right, down, behind); input and result have shape (n, 3)."""
     return np.asarray((in_camera(points, mount, lidar) - pose.place) @ pose.axes)
 
 
 def longest(chosen: NDArray[np.bool_], ranges: Array) -> NDArray[np.intp]:
-    """Indices of the longest run of selected beams without a step of their ranges."""
+    """Indices of the longest run of selected beams without a jump in range."""
     step = np.zeros(chosen.size, dtype=bool)
     with np.errstate(invalid="ignore"):
         step[1:] = ~(
@@ -143,14 +143,14 @@ def longest(chosen: NDArray[np.bool_], ranges: Array) -> NDArray[np.intp]:
 
 
 def plane_sigmas(view: BoardView, reader: BoardReader, lens: Lens, pose: BoardPose, ends: Array) -> tuple[float, float]:
-    """Standard deviations from the noise of the corners: plane at the middle of the line, m, and its slope, rad.
+    """Standard deviations due to corner noise: of the plane at the line's midpoint (m), and of its slope (rad).
 
     Args:
         view: view of the board.
         reader: reader that found the board.
         lens: lens of the camera.
         pose: pose of the board.
-        ends: ends of the line, in the camera's axes, m, (2, 3).
+        ends: end points of the line in the camera frame (m), shape (2, 3).
     """
     start = np.concatenate((np.ravel(cv2.Rodrigues(pose.axes)[0]), pose.place))
     _, slopes = cv2.projectPoints(reader.points[view.sighting.ids], start[:3], start[3:], lens.matrix, lens.distortion)
@@ -170,11 +170,11 @@ def plane_sigmas(view: BoardView, reader: BoardReader, lens: Lens, pose: BoardPo
 
 
 def residuals(parameters: Array, lines: Sequence[BoardLine], lidar: LidarPlace) -> Array:
-    """Residuals of lines against planes, in standard deviations, shape (n, 2).
+    """Residuals between lines and planes, in standard deviations, shape (n, 2).
 
     Args:
-        parameters: mount (``NAMES``), size of the board as a fraction of the stated size, and the lidar's range excess,
-            m.
+        parameters: mount (``NAMES``), actual board size as a fraction of the stated size, and the lidar's range
+            bias (m).
         lines: lines on the board.
         lidar: mount of the lidar.
     """
@@ -191,11 +191,11 @@ def residuals(parameters: Array, lines: Sequence[BoardLine], lidar: LidarPlace) 
 
 
 def fit(lines: Sequence[BoardLine], mount: Array, lidar: LidarPlace, size_error: float) -> FitResult:
-    """Fit the mount by least squares; parameters as in ``residuals``.
+    """Fit the mount by least squares; the parameters are those of ``residuals``.
 
     Args:
         lines: lines on the board.
-        mount: first guess.
+        mount: initial guess.
         lidar: mount of the lidar.
         size_error: standard deviation of the board's relative size.
     """
@@ -223,7 +223,7 @@ def fit_mount(
         focal_error: relative standard deviation of the focal length, which has the same effect as the board's size.
 
     Raises:
-        InputError: too few views, a board of another size, or inconsistent views.
+        InputError: there are too few views, the board's size is wrong, or the views are inconsistent.
     """
     found = mount
     unknown = 0.3  # standard deviation before the lidar is used
@@ -243,7 +243,7 @@ def fit_mount(
 
 
 def _agreeing(lines: list[BoardLine], found: FitResult, lidar: LidarPlace) -> list[BoardLine]:
-    """Fit without outliers, at most one view in five.
+    """Return the lines that agree with the fit; at most one view in five may be rejected as an outlier.
 
     Raises:
         InputError: there are more outliers.
@@ -261,7 +261,7 @@ def _agreeing(lines: list[BoardLine], found: FitResult, lidar: LidarPlace) -> li
 
 
 def _check_size(found: FitResult, board: BoardConfig) -> None:
-    """Refuse a board whose printed size, measured by the lidar, differs from the stated size.
+    """Reject a board whose size, as measured by the lidar, differs from the stated size.
 
     Raises:
         InputError: the sizes differ.

@@ -1,7 +1,7 @@
-"""Camera views of a hand-held board, and the views still missing; free of side effects, image by image.
+"""Camera views of a hand-held board, and the views still missing; processed image by image, without side effects.
 
-A view is valid if the operator held the board still for a moment: its corners are averaged over that time, and it
-includes the lidar scans of that time.
+A view is valid if the operator held the board still for a moment: the corners are averaged over that time, and the view
+includes the lidar scans from that time.
 """
 
 import math
@@ -35,7 +35,7 @@ SIDES: Final = ("left edge closer", "right edge closer", "top edge closer", "bot
 
 @dataclass(frozen=True)
 class BoardView:
-    """View of a board held still."""
+    """View of a board that was held still."""
 
     sighting: BoardSighting
     """Corners, averaged over the images of the view"""
@@ -56,7 +56,7 @@ def of_scans(scans: Sequence[LaserScan]) -> tuple[Array, Array]:
 
 @dataclass
 class BoardAttempts:
-    """Image counts since the last view, by defect."""
+    """Number of images since the last view, by defect."""
 
     pictures: int = 0
     unseen: int = 0
@@ -73,7 +73,7 @@ class BoardGuide:
 
     Args:
         reader: reader of the board.
-        lens: configured lens, used only to judge tilts and distances.
+        lens: configured lens, used only to estimate tilts and distances.
         beams: whether the lidar also sees the board in a view; None without a lidar.
         patience: timeout without a new view (s).
     """
@@ -96,9 +96,9 @@ class BoardGuide:
 
         Args:
             stamp: image time (ns).
-            sighting: the board in the image; None if it is not visible, or the image is ``damaged``.
+            sighting: the board in the image; None if the board is not visible, or if the image is ``damaged``.
             scans: scans since the last call.
-            damaged: the image cannot be decoded.
+            damaged: whether the image could not be decoded.
 
         Raises:
             InputError: no new view for too long; the message names the fault or the missing views.
@@ -115,7 +115,7 @@ class BoardGuide:
         return view
 
     def keep(self, view: BoardView) -> None:
-        """Keep a view."""
+        """Store a view."""
         self.views.append(view)
         if self.beams is not None and self.beams(view):
             self.seen_by_lidar.append(view)
@@ -171,7 +171,7 @@ class BoardGuide:
         return found
 
     def uncovered(self) -> list[str]:
-        """Ninths of the image with too few corners."""
+        """Ninths of the image that contain too few corners."""
         width, height = self.lens.size
         counts = np.zeros((3, 3), np.int64)
         for view in self.views:
@@ -209,12 +209,12 @@ class BoardGuide:
         return [f"its {side}{how} ({more} more)" for side, more in zip(SIDES, short.tolist(), strict=True) if more > 0]
 
     def progress(self) -> tuple[float, float]:
-        """Progress and total."""
+        """Return the progress and its total."""
         left = len(self.missing())
         return (1.0, 1.0) if not left else (len(self.views), len(self.views) + left)
 
     def trouble(self) -> str:
-        """Return one sentence with the reason why no new view was accepted."""
+        """Return a sentence that explains why no new view was accepted."""
         a, board = self.attempts, self.reader.board
         shape = f"{board.columns} x {board.rows} squares"
         within = f"in {self.patience:g} s"
@@ -242,19 +242,19 @@ class BoardGuide:
 
 
 def apart(one: BoardSighting, other: BoardSighting) -> Array:
-    """Distances of the common corners (px); (n,)."""
+    """Distances between common corners (px), shape (n,)."""
     _, a, b = np.intersect1d(one.ids, other.ids, return_indices=True)
     return np.asarray(np.hypot(*(one.corners[a] - other.corners[b]).T))
 
 
 def moved(one: BoardSighting, other: BoardSighting) -> float:
-    """Maximum motion of four of five common corners (px); inf without common corners."""
+    """Maximum displacement of the steadiest four fifths of the common corners (px); inf without common corners."""
     distances = apart(one, other)
     return float(np.percentile(distances, 80)) if distances.size else math.inf
 
 
 def averaged(sightings: Sequence[BoardSighting]) -> BoardSighting:
-    """Mean corners over the sightings, for corners found in most of them."""
+    """Mean positions of the corners that were found in most of the sightings."""
     ids = np.concatenate([s.ids for s in sightings])
     corners = np.concatenate([s.corners for s in sightings])
     numbers, counts = np.unique(ids, return_counts=True)

@@ -52,7 +52,7 @@ _BOARD: Final = Confirm(
 
 @dataclass(frozen=True, slots=True)
 class CameraWizard:
-    """Collects images and scans of a board until they suffice."""
+    """Wizard that collects images and scans of a board until there are enough."""
 
     name: ClassVar[WizardName] = "camera"
     doc: ClassVar[str] = "camera lens, and camera pose relative to the lidar, from a board held in front of both"
@@ -65,7 +65,7 @@ class CameraWizard:
 
     @classmethod
     def of(cls, columns: int, rows: int, square: float, marker: float, lens_only: bool, patience: float) -> Self:
-        """Create it from the command's options; lengths in m.
+        """Create a wizard from the command's options; lengths in m.
 
         Raises:
             InputError: a marker is larger than its square.
@@ -122,7 +122,7 @@ class CameraWizard:
         return result_of(found, len(views), placed)
 
     async def _lidar(self, context: WizardContext) -> LidarPlace | None:
-        """Return the lidar's pose, from the current angles of its mount joints."""
+        """Return the lidar's pose at the current angles of its mount joints."""
         devices = context.config.devices
         if devices.lidar is None:
             return None
@@ -130,7 +130,7 @@ class CameraWizard:
 
 
 def decoded(message: CompressedImage) -> Picture | None:
-    """Decode to a grey image, (height, width); None if it is damaged, as some webcam images are."""
+    """Decode to a grey image, shape (height, width); None if it is damaged, as images from some webcams are."""
     if not message.data:
         return None
     grey: Picture | None = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_GRAYSCALE)
@@ -138,9 +138,9 @@ def decoded(message: CompressedImage) -> Picture | None:
 
 
 def check_kept(before: LidarPlace, after: LidarPlace | None) -> None:
-    """Refuse the views if the lidar's joints turned during the run.
+    """Reject the views if the lidar's joints turned during the run.
 
-    The operator leant on the truck, or the ground gave way.
+    Possible causes: the operator leant on the truck, or the ground gave way.
 
     Raises:
         InputError: the joints have turned.
@@ -154,7 +154,7 @@ def check_kept(before: LidarPlace, after: LidarPlace | None) -> None:
 
 
 def lens_of(views: Sequence[BoardView], reader: BoardReader, size: tuple[int, int]) -> tuple[LensFit, list[BoardView]]:
-    """Fit the lens; return it with the views used. Views with large corner errors are dropped.
+    """Fit the lens; return the fit and the views used. Views with large corner errors are dropped.
 
     Raises:
         InputError: no lens fits the corners.
@@ -194,18 +194,18 @@ def mount_of(
     lidar: LidarPlace,
     lidar_mount: dict[str, float],
 ) -> PlacedMount:
-    """Fit the mount, given the lens and the lidar.
+    """Fit the mount, given the lens and the lidar's mount.
 
     Args:
         views: views of the board.
-        reader: source of the views.
-        found: the lens.
-        mount: as configured, ``NAMES``.
-        lidar: its pose.
+        reader: reader that found the boards.
+        found: fitted lens.
+        mount: configured mount, ``NAMES``.
+        lidar: pose of the lidar.
         lidar_mount: half-widths of the intervals of the lidar mount, by name.
 
     Raises:
-        InputError: see ``fit_mount``; or the views do not determine the mount.
+        InputError: see ``fit_mount``; also raised if the views do not determine the mount.
     """
     fx, fy = found.lens.parameters[:2]
     focal = float(np.hypot(*found.sigmas[:2] / (fx, fy)) / math.sqrt(2))
@@ -225,14 +225,14 @@ def mount_of(
 
 
 def lidar_halves(context: WizardContext) -> dict[str, float]:
-    """Half-widths of the lidar mount from its calibration (m and rad); empty if it was not calibrated."""
+    """Half-widths of the lidar mount from its calibration (m and rad); empty if the lidar was not calibrated."""
     known = context.known.get("lidar")
     estimates = () if known is None else known.estimates
     return {e.name: (e.high - e.low) / 2 for e in estimates if e.low is not None and e.high is not None}
 
 
 def result_of(found: LensFit, views: int, placed: PlacedMount | None = None) -> Result:
-    """Assemble the result; without ``placed`` for the lens alone."""
+    """Assemble the result; without ``placed``, it contains only the lens."""
     lens, (width, height) = found.lens, found.lens.size
     sized = "image size that the lens parameters apply to"
     estimates = [

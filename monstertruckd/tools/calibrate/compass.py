@@ -1,4 +1,4 @@
-"""Hard and soft iron of the compass from circles driven on level ground.
+"""Hard and soft iron of the compass, from circles driven on level ground.
 
 On level ground the horizontal magnetic field of a turning truck traces a circle. The truck's iron shifts the circle
 (hard iron) and deforms it to an ellipse (soft iron). A level circle determines only this ellipse: not the vertical
@@ -38,7 +38,7 @@ _NAMES: Final = ("hard_x", "hard_y", "soft_xx", "soft_xy", "soft_yy")
 
 @dataclass(frozen=True, slots=True)
 class FieldCircle:
-    """Readings of the driven circles, (n,) each: field in microtesla, tilt in rad, motor current in A."""
+    """Readings from the driven circles, (n,) each: field (microtesla), tilt (rad), motor current (A)."""
 
     x: Array
     y: Array
@@ -51,7 +51,7 @@ class FieldCircle:
 
     @classmethod
     def of(cls, tracks: list[MoveRecord]) -> "FieldCircle":
-        """Select readings while the truck moved, including those that the driver flags as disturbed.
+        """Select the readings taken while the truck moved, including those that the driver flagged as disturbed.
 
         Raises:
             InputError: the compass sends no field or too few readings.
@@ -78,7 +78,7 @@ class FieldCircle:
         return cls(*np.array(rows).T)
 
     def plot(self, iron: IronConfig | None = None) -> Plot:
-        """Plot the horizontal field, and the ellipse that ``iron`` makes of a circle."""
+        """Plot the horizontal field, and the ellipse into which ``iron`` deforms a circle."""
         field, ellipse = np.column_stack((self.x, self.y)), None
         if iron is not None:
             soft = np.array(((iron.soft_xx, iron.soft_xy), (iron.soft_xy, iron.soft_yy)))
@@ -91,7 +91,7 @@ class FieldCircle:
 
 @dataclass(frozen=True, slots=True)
 class CompassWizard:
-    """One circle forward and one back: the effect of the motor current changes its sign with the direction."""
+    """Wizard that drives one circle forward and one back: the effect of the motor current changes sign."""
 
     name: ClassVar[WizardName] = "compass"
     doc: ClassVar[str] = "magnetism of the robot, from a driven circle"
@@ -137,7 +137,7 @@ def result_of(circle: FieldCircle) -> Result:
     """Fit the ellipse and check it.
 
     Raises:
-        InputError: the circle is incomplete, the field turns in the wrong direction, or it is not an ellipse.
+        InputError: the circle is incomplete, the field turns in the wrong direction, or the shape is not an ellipse.
     """
     if np.ptp(circle.heading) == 0.0:
         raise InputError(
@@ -211,9 +211,10 @@ def result_of(circle: FieldCircle) -> Result:
 
 
 def lasting(residuals: Array) -> float:
-    """RMS of the slow part of the residuals, over an eighth of a circle, in the order of time; 0 for pure noise.
+    """RMS of the slowly varying part of the residuals, over an eighth of a circle; 0 for pure noise.
 
-    Computed from means over this number of readings, minus their noise; up to twice the noise is treated as noise.
+    The residuals must be in chronological order. The result is computed from means over an eighth of the readings,
+    minus their noise; values up to twice the noise are treated as noise.
     """
     window = max(residuals.size // 16, 1)
     means = np.convolve(residuals, np.ones(window) / window, "valid")
@@ -222,7 +223,7 @@ def lasting(residuals: Array) -> float:
 
 
 def _motor(circle: FieldCircle, fit: FitResult) -> list[Estimate]:
-    """Field per ampere of motor current, and its maximum effect on the heading."""
+    """Magnetic field per ampere of motor current, and its maximum effect on the heading."""
     if not np.isfinite(fit.standard_errors[5:]).all():
         return []
     halves = NORMAL * correlation_factor(fit.residuals) * fit.standard_errors[5:]
@@ -248,8 +249,8 @@ def _motor(circle: FieldCircle, fit: FitResult) -> list[Estimate]:
 def fit_ellipse(circle: FieldCircle) -> FitResult:
     """Fit the length of the levelled field by least squares; parameters hard_x, hard_y, u, v, radius, motor_x, motor_y.
 
-    ``soft`` is [[e^u w, v], [v, w e^-u]] with w^2 = 1 + v^2: symmetric, determinant 1. ``motor`` is the field per motor
-    current, uT/A.
+    ``soft`` is [[e^u w, v], [v, w e^-u]] with w^2 = 1 + v^2: symmetric, determinant 1. ``motor`` is the magnetic field
+    per ampere of motor current (uT/A).
     """
     middle = np.array([(values.max() + values.min()) / 2 for values in (circle.x, circle.y)])
     radius = max(float(np.ptp(circle.x)), float(np.ptp(circle.y)), 1.0) / 2
@@ -275,7 +276,7 @@ def _iron(parameters: Array) -> tuple[float, ...]:
 
 
 def _iron_errors(fit: FitResult) -> Array:
-    """Standard errors in the order of ``_NAMES``, from the derivatives of ``_iron``."""
+    """Standard errors in the order of ``_NAMES``, propagated through the derivatives of ``_iron``."""
     point, errors = fit.parameters[:4], fit.standard_errors[:4]
     step = 1e-6
     slopes = np.array(
@@ -285,7 +286,7 @@ def _iron_errors(fit: FitResult) -> Array:
 
 
 def _angles(circle: FieldCircle, iron: IronConfig) -> Array:
-    """Headings from the field corrected by ``iron``, rad."""
+    """Headings from the field corrected by ``iron`` (rad)."""
     forward, left = level_field((circle.x, circle.y, circle.z), circle.pitch, circle.roll, iron)
     return np.asarray(np.arctan2(left, forward))
 

@@ -4,7 +4,7 @@ Only motor turns per metre of floor can be measured: gear ratio and wheel radius
 keeps the configured radius and fits the ratio.
 
 Dead time and lag are fitted to the gate's commands and the motor's turns. Start and stop are fitted separately, because
-drivers forward a lower speed at once and a higher one in their next cycle.
+drivers forward a lower speed immediately and a higher one in their next cycle.
 """
 
 import math
@@ -49,7 +49,7 @@ _STRAIGHT: Final = Confirm(
 
 @dataclass(frozen=True, slots=True)
 class DriveWizard:
-    """Wizard: the sign, then several runs forward and back."""
+    """Wizard that determines the sign first, then drives several runs forward and back."""
 
     name: ClassVar[WizardName] = "drive"
     doc: ClassVar[str] = "forward direction, motor turns per metre from taped distances, and response delay"
@@ -163,9 +163,9 @@ def turns_per_metre(values: Sequence[float], tape_error: float, metres: float, b
     """Compute the motor turns per metre on this floor.
 
     Args:
-        values: value of every run, 1/m.
-        tape_error: standard deviation of one reading of the tape, m.
-        metres: length of a run, m.
+        values: result of each run (1/m).
+        tape_error: standard deviation of one tape reading (m).
+        metres: length of a run (m).
         bend: maximum unnoticed curvature of a run, as a fraction of its length.
     """
     middle = float(np.median(values))
@@ -174,13 +174,13 @@ def turns_per_metre(values: Sequence[float], tape_error: float, metres: float, b
 
 
 def on_any_floor(found: Interval) -> Interval:
-    """Extend a value measured on one floor to other floors."""
+    """Widen the interval of a value measured on one floor so that it covers other floors."""
     return found.joined(found.value * ASSUMED.floor_slip)
 
 
 @dataclass(frozen=True, slots=True)
 class TapedRun:
-    """One taped run."""
+    """A run whose distance was measured with a tape."""
 
     turns: float
     """Turns of the motor."""
@@ -191,11 +191,11 @@ class TapedRun:
 
     @classmethod
     def of(cls, track: MoveRecord, distance: float, *, straight: bool | None = None) -> "TapedRun":
-        """Compute the distance along the arc from the taped chord, m.
+        """Compute the distance along the arc (m) from the taped chord.
 
         Args:
             track: record of the run.
-            distance: length of the chord, m.
+            distance: length of the chord (m).
             straight: for a truck without a compass, whether the run looked straight to the operator: half of the
                 maximum unnoticed bend is subtracted.
 
@@ -222,7 +222,7 @@ class TapedRun:
 
 
 def arc(chord: float, turn: float) -> float:
-    """Length of a circular arc, m, from its chord (m) and its angle (rad)."""
+    """Length of a circular arc (m), from its chord (m) and its angle (rad)."""
     half = turn / 2
     return chord * half / math.sin(half) if half else chord
 
@@ -244,7 +244,7 @@ LEAST_POSITIONS: Final = 8
 
 @dataclass(frozen=True, slots=True)
 class HalfRun:
-    """First or second half of a run: from rest to half the distance, or from there to rest."""
+    """First or second half of a run: from rest to half the distance, or from half the distance to rest."""
 
     speed: Steps
     """Commanded motor speed, rad/s."""
@@ -255,7 +255,7 @@ class HalfRun:
 
     @classmethod
     def of(cls, record: MoveRecord, part: Part) -> Self | None:
-        """Extract it from a record; None if it contains too few positions."""
+        """Extract the half from a record; None if it contains too few positions."""
         if not record.drive_commands:
             return None
         times = np.array([reading.stamp for reading in record.drive]) / SECOND
@@ -268,7 +268,7 @@ class HalfRun:
         return cls(Steps.of(sent[:, 0], sent[:, 1]), times[kept], positions[kept])
 
     def residuals(self, delay: float, squared: float) -> Array:
-        """Residuals of the positions for the best gain and origin, rad; arguments as for ``Steps.integral``."""
+        """Residuals of the positions for the best gain and origin (rad); for the arguments see ``Steps.integral``."""
         due = self.speed.integral(self.times, delay, squared)
         return unexplained(self.positions - self.positions[0], due, np.ones_like(due))
 
@@ -279,10 +279,10 @@ def drive_response(records: Iterable[MoveRecord], part: Part, cycle: float) -> R
     Args:
         records: straight runs, including the rests.
         part: first or second half of the runs.
-        cycle: period at which the driver reads its commands, s.
+        cycle: period at which the driver reads its commands (s).
 
     Raises:
-        InputError: too few positions.
+        InputError: there are too few positions.
     """
     seen = [half for record in records if (half := HalfRun.of(record, part)) is not None]
     if not seen:
@@ -295,10 +295,10 @@ def drive_response(records: Iterable[MoveRecord], part: Part, cycle: float) -> R
 
 
 def drive_estimates(records: Iterable[MoveRecord], rate: float) -> list[Estimate]:
-    """Estimates for start and stop, for information; ``rate`` is the cycle rate of the driver, 1/s.
+    """Informational estimates for start and stop; ``rate`` is the driver's cycle rate (1/s).
 
     Raises:
-        InputError: as for ``drive_response``.
+        InputError: see ``drive_response``.
     """
     runs, found = list(records), []
     parts: tuple[tuple[Part, str], ...] = (("start", "starting"), ("stop", "stopping"))

@@ -1,4 +1,7 @@
-"""Biases of an inertial measurement unit at rest, and the scale of its yaw rate from full turns by the compass."""
+"""Biases of an inertial measurement unit at rest, and the scale of its yaw rate from full turns.
+
+The compass measures the turns.
+"""
 
 import math
 from collections.abc import Sequence
@@ -43,10 +46,10 @@ class Turn:
 
     @classmethod
     def of(cls, record: MoveRecord, bias: float, scale: float) -> "Turn":
-        """Create it from a move; rates are as published, corrected by ``bias`` (rad/s) and ``scale``.
+        """Create a turn from a move; published rates are corrected by ``bias`` (rad/s) and ``scale``.
 
         Raises:
-            InputError: no readings of the unit, a gap in them, or too few headings at rest.
+            InputError: the unit sent no readings, the readings have a gap, or there are too few headings at rest.
         """
         readings = record.of(topics.IMU)
         if len(readings) < 2:
@@ -68,7 +71,7 @@ class Turn:
 
 @dataclass(frozen=True, slots=True)
 class ImuWizard:
-    """Wizard: ten seconds at rest, then full circles in both directions."""
+    """Wizard that measures ten seconds at rest, then drives full circles in both directions."""
 
     name: ClassVar[WizardName] = "imu"
     doc: ClassVar[str] = "biases of the inertial unit at rest, and the scale of its yaw rate from full turns"
@@ -80,7 +83,7 @@ class ImuWizard:
 
     @classmethod
     def of(cls, rounds: int, still: bool) -> Self:
-        """Create it from the command's options."""
+        """Create a wizard from the command's options."""
         return cls(rounds, turns=not still)
 
     async def __call__(self, context: WizardContext) -> Result:
@@ -130,11 +133,11 @@ def result_of(
     Args:
         resting: readings of the unit at rest.
         tilt: tilt of the truck at rest.
-        turns: turns between rests; empty: the scale is kept.
-        before: correction already contained in ``resting``, by the names of the estimates.
+        turns: turns between rests; if empty, the scale is kept.
+        before: correction already contained in ``resting``, keyed by estimate name.
 
     Raises:
-        InputError: the unit was moved, or too few turns.
+        InputError: the unit was moved, or there are too few turns.
     """
     rates = np.array([(r.angular_velocity.x, r.angular_velocity.y, r.angular_velocity.z) for r in resting])
     rates = rates / (1.0, 1.0, before["rate_scale"]) + [before[f"rate_{axis}"] for axis in "xyz"]
@@ -182,7 +185,7 @@ def rate_scale(turns: Sequence[Turn], bias: Interval) -> Interval:
     """Factor that makes the integrated yaw rate equal to the turn measured by the compass.
 
     Raises:
-        InputError: too few turns, or turns in one direction only, which cannot separate bias and scale.
+        InputError: there are too few turns, or turns in only one direction, which cannot separate bias and scale.
     """
     least = 2  # minimum number of turns
     if len(turns) < least or len({turn.turned > 0 for turn in turns}) < least:
@@ -202,6 +205,6 @@ def rate_scale(turns: Sequence[Turn], bias: Interval) -> Interval:
 
 
 def _mean(values: Array) -> Interval:
-    """Mean of readings whose noise is correlated."""
+    """Mean of readings with correlated noise."""
     error = float(values.std(ddof=1)) / math.sqrt(values.size) * correlation_factor(values)
     return Interval(float(values.mean()), NORMAL * error)

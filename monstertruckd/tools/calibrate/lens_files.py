@@ -1,6 +1,6 @@
-"""Files of camera intrinsics: ``camera_info`` of ROS, camera chains of kalibr, matrices of OpenCV; pinhole and Brown.
+"""Camera intrinsics files: ``camera_info`` of ROS, camera chains of kalibr, OpenCV matrices; pinhole and Brown models.
 
-All formats count pixels from the centre of the first one, as ``LensConfig`` does.
+All formats measure pixel coordinates from the centre of the first pixel, as ``LensConfig`` does.
 """
 
 import re
@@ -35,11 +35,11 @@ def lens_from(text: str, file: Path, *, camera: str | None = None, size: tuple[i
     Args:
         text: text of the file.
         file: file name, for error messages.
-        camera: camera name in a chain of cameras; None: the only one.
-        size: image width and height (pixels), if the file does not state them.
+        camera: name of the camera in a camera chain; None if the file contains only one.
+        size: image width and height (px), if the file does not state them.
 
     Raises:
-        InputError: an unsupported lens model, or invalid numbers; the message names the first mistake.
+        InputError: the lens model is unsupported, or numbers are invalid; the message names the first mistake.
     """
     data = _data(text, file)
     with reading(file, EXPECTED):
@@ -100,7 +100,7 @@ def _opencv(name: str, rows: int, columns: int, data: list[float]) -> str:
 
 
 def _data(text: str, file: Path) -> Mapping[str, Any]:
-    """Mapping in a YAML file, or in OpenCV's dialect, whose first line and tags are not valid YAML."""
+    """Mapping in a YAML file, or in an OpenCV file, whose first line and tags are not valid YAML."""
     plain = re.sub(r"!!opencv-matrix\b", "", re.sub(r"\A\ufeff?%YAML[^\n]*\n(---[^\n]*\n)?", "", text))
     documents = [part for part in plain.split("\n---") if part.strip("- \n")]
     with reading(file, EXPECTED):
@@ -135,7 +135,7 @@ def _kalibr(row: Mapping[str, Any], file: Path) -> LensConfig:
 def _matrices(
     data: Mapping[str, Any], matrix: str, coefficients: str, file: Path, size: tuple[int, int] | None
 ) -> LensConfig:
-    """Intrinsics in the format of ROS or OpenCV: a matrix of nine numbers, and coefficients."""
+    """Intrinsics in ROS or OpenCV format: a matrix of nine numbers, and the distortion coefficients."""
     numbers = _floats(_numbers(data[matrix]), 9, matrix, file)
     fx, skew, cx, a, fy, cy, b, c, one = numbers
     if (skew, a, b, c, one) != (0.0, 0.0, 0.0, 0.0, 1.0):

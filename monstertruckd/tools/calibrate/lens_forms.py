@@ -1,10 +1,10 @@
-"""Names of the file formats of camera intrinsics, without heavy imports, for the command line."""
+"""Names of the file formats for camera intrinsics, without heavy imports, for the command line."""
 
 from enum import StrEnum
 
 
 class LensForm(StrEnum):
-    """File formats of camera intrinsics."""
+    """File formats for camera intrinsics."""
 
     CONFIG = "config"
     ROS = "ros"

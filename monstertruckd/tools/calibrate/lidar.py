@@ -3,11 +3,11 @@
 The lidar sees the same surroundings at both rests. Registration of its scans gives the motion of the lidar; wheels and
 steering give the motion of the body. The mount X solves A X = X B (Tsai and Lenz, "A New Technique for Fully Autonomous
 and Efficient 3D Robotics Hand/Eye Calibration", IEEE Transactions on Robotics and Automation, 1989), here in the plane.
-The turn is taken from the scans, which measure it best. So errors of compass and steering have no effect; the fit
-depends on the distance, whose scale is fitted too, and on the direction of travel.
+The turn is taken from the scans, which measure it best, so errors of compass and steering have no effect. The fit
+depends on the distance, whose scale is also fitted, and on the direction of travel.
 
 Pitch and roll follow from the height of the beam above the floor: at the lidar, on a wall ahead and on a wall to the
-left. The beam is infrared: the camera of a phone shows it.
+left. The beam is infrared; a phone camera shows it.
 """
 
 import math
@@ -74,15 +74,15 @@ class LidarLeg:
 
     @classmethod
     def of(cls, record: MoveRecord, chassis: Chassis, mount: tuple[float, float, float]) -> "LidarLeg":
-        """Create it from a move with constant steering.
+        """Create a leg from a move with constant steering.
 
         Args:
             record: record with scans.
             chassis: kinematics, for distance and direction.
-            mount: configured mount, as a first guess.
+            mount: configured mount, used as the initial guess.
 
         Raises:
-            InputError: too few scans at rest, or scans that do not match.
+            InputError: there are too few scans at rest, or the scans do not match.
         """
         scans, after = (resting_scan(found) for found in record.at_rest(topics.SCAN))
         _, front, rear = record.steps()
@@ -108,7 +108,7 @@ class LidarLeg:
 
 @dataclass(frozen=True, slots=True)
 class Offset:
-    """Measure the time offset between the stamps of odometry and scans, by turning."""
+    """Offset between the stamps of odometry and scans, measured by turning."""
 
     value: Interval
     """Offset, s; positive if odometry is ahead."""
@@ -117,7 +117,7 @@ class Offset:
 
 @dataclass(frozen=True, slots=True)
 class LidarWizard:
-    """Wizard: quarter circles in both directions and straights, then weaves for the clocks, and heights on request."""
+    """Wizard that drives quarter circles in both directions, straights and weaves; measures heights on request."""
 
     name: ClassVar[WizardName] = "lidar"
     doc: ClassVar[str] = (
@@ -204,7 +204,7 @@ class LidarWizard:
 
 
 async def joint_angles(context: WizardContext) -> tuple[float, float]:
-    """Current pitch and roll of the joints below the lidar, rad; 0 without joints.
+    """Current pitch and roll of the joints below the lidar (rad); 0 without joints.
 
     Raises:
         InputError: a servo does not answer.
@@ -223,7 +223,7 @@ async def joint_angles(context: WizardContext) -> tuple[float, float]:
 
 
 def crab_error(context: WizardContext) -> float:
-    """Standard deviation of the crab angle, rad: from the steering's calibration, or by eye."""
+    """Standard deviation of the crab angle (rad), from the steering calibration, or as judged by eye."""
     steering = context.known.get("steering")
     halves = []
     for axle in AXLES:
@@ -247,13 +247,13 @@ def result_of(
 
     Args:
         legs: moves between rests.
-        mount: configured mount, m and rad.
-        crab: standard deviation of the direction of travel, rad.
-        offset: offset of the clocks, s; None if not measured.
+        mount: configured mount (m and rad).
+        crab: standard deviation of the direction of travel (rad).
+        offset: offset between the clocks (s); None if not measured.
         level: pitch and roll, if measured.
 
     Raises:
-        InputError: too few legs in one direction.
+        InputError: there are too few legs in one direction.
     """
     turned = np.array([leg.seen[2] for leg in legs])
     if not ((turned > 0.5).sum() >= 2 and (turned < -0.5).sum() >= 2 and (np.abs(turned) < 0.3).any()):
@@ -310,9 +310,9 @@ def fit_mount(legs: Sequence[LidarLeg], mount: tuple[float, float, float], crab:
 
 
 def seen_motion(parameters: Array, distances: Array, turns: Array, travels: Array) -> Array:
-    """Predict the lidar's motion on legs, (n, 3): parameters as in ``fit_mount``.
+    """Predict the lidar's motion on legs, shape (n, 3); the parameters are those of ``fit_mount``.
 
-    Distances in m, turns and directions in rad.
+    Distances are in m, turns and directions in rad.
     """
     x, y, yaw, scale, crab = parameters.tolist()
     mount = np.array((x, y, yaw))
@@ -325,7 +325,7 @@ def seen_motion(parameters: Array, distances: Array, turns: Array, travels: Arra
 
 
 def _arc(distance: float, crab: float, turn: float) -> Array:
-    """Motion of the body on an arc, at an angle between its axis and its direction of travel."""
+    """Motion of the body along an arc if its axis is at the angle ``crab`` to its direction of travel."""
     half = turn / 2
     chord = distance * sinc(half)
     return np.array((chord * math.cos(half + crab), chord * math.sin(half + crab), turn))
@@ -347,11 +347,11 @@ def check_way_round(before: Scan, after: Scan, moved: tuple[float, float], mount
         before: scan at the first rest.
         after: scan at the second rest.
         moved: distance (m) and turn (rad) of the body.
-        mount: as configured.
+        mount: configured mount.
         overlap: overlap of the scans with the configured mount.
 
     Raises:
-        InputError: the lidar is mounted the other way.
+        InputError: the lidar is mounted upside down or facing backwards.
     """
     body = _arc(moved[0], 0.0, moved[1])
     mountings = (
@@ -384,10 +384,10 @@ def _geometry(scan: LaserScan) -> ScanGeometry:
 
 
 def resting_scan(scans: Sequence[LaserScan]) -> Scan:
-    """Points of the mean of several scans at rest, in the lidar's frame.
+    """Points of the mean of several scans at rest, in the lidar frame.
 
     Raises:
-        InputError: too few scans.
+        InputError: there are too few scans.
     """
     if len(scans) < LEAST_SCANS:
         raise InputError(f"only {len(scans)} scans at rest: expected {LEAST_SCANS} at each end")
@@ -400,7 +400,7 @@ def resting_scan(scans: Sequence[LaserScan]) -> Scan:
 
 
 def beam_distance(scans: Sequence[LaserScan], angle: float) -> float:
-    """Median range around an angle, m.
+    """Median range around an angle (m).
 
     Raises:
         InputError: no wall is visible.
@@ -416,11 +416,11 @@ def beam_distance(scans: Sequence[LaserScan], angle: float) -> float:
 
 
 def beam_tilt(heights: Sequence[float], walls: tuple[float, float]) -> tuple[float, float]:
-    """Compute pitch (nose down positive) and roll (right side down positive) of the scan plane, rad.
+    """Compute pitch (nose down positive) and roll (right side down positive) of the scan plane (rad).
 
     Args:
-        heights: heights of the beam at the lidar, on the wall ahead and on the wall to the left, m.
-        walls: distances to the two walls, m.
+        heights: heights of the beam at the lidar, on the wall ahead and on the wall to the left (m).
+        walls: distances to the two walls (m).
 
     Raises:
         InputError: the heights are impossible.
@@ -438,9 +438,9 @@ def beam_tilt(heights: Sequence[float], walls: tuple[float, float]) -> tuple[flo
 
 
 def time_offset(records: Sequence[MoveRecord]) -> Offset | None:
-    """Estimate the offset of the clocks of odometry and scans from weaving; None if it cannot be determined.
+    """Estimate the offset between the odometry and scan clocks from weaving; None if it cannot be determined.
 
-    The correlation of ``find_offset`` finds a large offset; least squares of the yaws refine it.
+    The correlation of ``find_offset`` finds a large offset; a least-squares fit of the yaws refines it.
     """
     series = [found for record in records if (found := _yaws(record)) is not None]
     if not series:
@@ -454,7 +454,7 @@ def fit_offset(series: Sequence[tuple[Array, Array, Array, Array]], coarse: floa
 
     Args:
         series: for each move, times (s) and yaws (rad) of the scans, and times and yaws of odometry.
-        coarse: first guess, s; None: 0.
+        coarse: initial guess (s); None means 0.
     """
 
     def residual(parameters: Array) -> Array:
@@ -473,7 +473,7 @@ def fit_offset(series: Sequence[tuple[Array, Array, Array, Array]], coarse: floa
 
 
 def _yaws(record: MoveRecord) -> tuple[Array, Array, Array, Array, Array] | None:
-    """Stamps and yaws of the scans, odometry's yaws at these stamps, and its own stamps and yaws.
+    """Stamps and yaws of the scans, odometry yaws at these stamps, and the stamps and yaws of odometry.
 
     None if there are too few.
     """

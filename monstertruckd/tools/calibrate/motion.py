@@ -1,4 +1,4 @@
-"""Moves of a wizard: drive requests sent through the safety gate, as by any operator."""
+"""Moves of a wizard: drive requests sent through the safety gate, like those of any operator."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
@@ -51,7 +51,7 @@ class Mover:
 
     Args:
         truck: link to the truck.
-        clock: time.
+        clock: time source.
         chassis: drivetrain data, to compute distances.
     """
 
@@ -66,10 +66,10 @@ class Mover:
         """Drive ``move`` and return its record; ``report`` gets the record so far and the distance (m).
 
         The truck is always stopped and disarmed at the end. After a transient stop, such as a late request, the mover
-        reports through ``say``, drives back to the start of the move and repeats it, at most twice.
+        notifies the operator through ``say``, drives back to the start of the move and repeats it, at most twice.
 
         Raises:
-            RequestRefusedError: the gate refused, stopped or holds the truck; carries the gate's reason.
+            RequestRefusedError: the gate refused, stopped or held the truck; carries the gate's reason.
             NoAnswerError: the truck does not move although the gate allows it, or sends no feedback.
         """
         unmoved = 0.01  # maximum distance from the start at which a move counts as not begun (m)
@@ -144,7 +144,7 @@ class Mover:
 
 
 class _Run:
-    """One move: renews the lease, collects feedback, follows the gate's state."""
+    """One move: renews the lease, collects feedback and follows the gate's state."""
 
     def __init__(
         self,
@@ -171,12 +171,12 @@ class _Run:
 
     @property
     def robot_time(self) -> int:
-        """Latest stamp received from the robot (ns), on a clock that differs from this computer's clock."""
+        """Latest stamp received from the robot (ns); the robot's clock differs from this computer's."""
         stamps = [0 if self.state is None else self.state.stamp, *(reading.stamp for reading in self.track.drive[-1:])]
         return max(stamps)
 
     def begin(self) -> None:
-        """Discard the readings so far."""
+        """Discard the readings collected so far."""
         self.track = MoveRecord()
 
     async def free(self) -> None:
@@ -197,7 +197,7 @@ class _Run:
             raise RequestRefusedError(Reason.BUSY, f"the robot is already armed{holder}: disarm it first")
 
     async def arm(self) -> None:
-        """Request standstill for a moment, and arm without planners, so that nothing else moves the truck.
+        """Request standstill briefly, then arm without planners, so that nothing else moves the truck.
 
         Raises:
             RequestRefusedError: the gate refused.
@@ -255,7 +255,7 @@ class _Run:
             self._check()
 
     async def rest(self, front: float, rear: float) -> None:
-        """Stop and wait for rest."""
+        """Stop and wait until the truck is at rest."""
         end = self._clock.now() + round(RESTING * SECOND)
         still = -1
         while self._clock.now() < end:
@@ -322,10 +322,10 @@ class _Run:
 
 
 def _moved(since: DriveFeedback, newest: DriveFeedback) -> bool:
-    """Whether the motor has turned by more than an encoder that alternates between two counts (rad)."""
+    """Return whether the motor has turned further than an encoder that alternates between two counts would show."""
     return abs(newest.position - since.position) > 0.1
 
 
 def _rested(since: DriveFeedback, newest: DriveFeedback) -> bool:
-    """Whether a drive that has not moved since a reading is at rest."""
+    """Return whether a drive that has not moved since a reading is at rest."""
     return newest.stamp - since.stamp > SECOND // 2

@@ -65,7 +65,7 @@ class Square:
 
 @dataclass(frozen=True, slots=True)
 class OdometryWizard:
-    """Wizard: squares to the left and right in turn."""
+    """Wizard that drives squares alternately to the left and to the right."""
 
     name: ClassVar[WizardName] = "odometry"
     doc: ClassVar[str] = (
@@ -191,9 +191,9 @@ class OdometryWizard:
 
 
 def _turned(record: MoveRecord, left: float) -> bool:
-    """Return a condition: whether the truck has turned by an angle (rad, left positive).
+    """Return a condition that holds once the truck has turned by an angle (rad, left positive).
 
-    A corner thus compensates a bent side.
+    The corner thus compensates for a side that was not straight.
     """
     return record.turned() * math.copysign(1.0, left) >= abs(left)
 
@@ -207,7 +207,7 @@ class SquareModel:
     Args:
         model: model of the truck.
         maps: servo maps used by the daemon.
-        ahead: distance of the front bumper from the base, m.
+        ahead: distance of the front bumper from the base (m).
     """
 
     def __init__(self, model: SteeringModel, maps: Maps, ahead: float) -> None:
@@ -216,7 +216,7 @@ class SquareModel:
         self._ahead = ahead
 
     def maps(self, offset: float) -> Maps:
-        """Shift the servos by ``offset``, rad: front to the left, rear to the right."""
+        """Return the servo maps shifted by ``offset`` (rad): front to the left, rear to the right."""
         shift = math.degrees(offset)
         front, rear = (
             c - s * d for c, s, d in zip(self._maps.centres, self._maps.scales, (shift, -shift), strict=True)
@@ -224,13 +224,13 @@ class SquareModel:
         return Maps((front, rear), self._maps.scales, self._maps.deficit)
 
     def turns(self, legs: Sequence[SteeringRun], parameters: Array) -> Array:
-        """Predict the turn of each leg (rad); (n,)."""
+        """Predict the turn of each leg (rad), shape (n,)."""
         distance, base, offset = parameters
         turns, _ = self._model.predict(legs, self.maps(float(offset)))
         return np.asarray(turns * distance / base)
 
     def end(self, square: Square, parameters: Array) -> tuple[float, float]:
-        """Predict the bumper's position ahead and left of its mark at the end of a square (m)."""
+        """Predict how far the bumper is ahead and to the left of its mark at the end of a square (m)."""
         distance, base, offset = parameters.tolist()
         maps = self.maps(offset)
         chassis = self._model.chassis
@@ -257,7 +257,7 @@ class SquareModel:
         return x + self._ahead * (math.cos(yaw) - 1.0), y + self._ahead * math.sin(yaw)
 
     def fit(self, squares: Sequence[Square], tape: float, string: float) -> FitResult:
-        """Fit by least squares; residuals in standard deviations, priors last."""
+        """Fit the parameters by least squares; residuals are in standard deviations, with the priors last."""
         legs = [leg for square in squares for leg in square.legs]
         turned = np.array([leg.turn for leg in legs])
         sigmas = np.array([ASSUMED.turn_of_leg(leg.sigma, self._model.distance(leg)) for leg in legs])
@@ -285,7 +285,7 @@ class SquareModel:
 
 
 def check_senses(model: "SquareModel", squares: Sequence[Square]) -> None:
-    """Refuse turns opposite to the steering.
+    """Reject turns opposite to the steering.
 
     Raises:
         InputError: the truck or an axle turned the wrong way.
@@ -301,7 +301,7 @@ def check_senses(model: "SquareModel", squares: Sequence[Square]) -> None:
 
 
 def intervals(fit: FitResult, measured: int) -> tuple[Interval, Interval, Interval]:
-    """Return corrections of distance and wheelbase (fractions) and offset (rad).
+    """Return corrections to distance and wheelbase (fractions) and the offset (rad).
 
     Raises:
         InputError: a correction exceeds its limit.

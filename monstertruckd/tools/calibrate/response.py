@@ -2,7 +2,7 @@
 
 ``s`` seconds after the dead time, a command step of ``k`` has added ``k (s - lag (1 - exp(-s / lag)))`` to the time
 integral of the response. A sensor measures this integral: the truck's turn for the steering, its distance for the
-drive. The fit parameters are the delay (dead time plus lag) and the square of the lag: slow commands show only the
+drive. The fit parameters are the delay (dead time plus lag) and the square of the lag: slow commands reveal only the
 delay, and the lag appears as its square in the rounding of the response.
 """
 
@@ -32,15 +32,15 @@ class Steps:
 
     @classmethod
     def of(cls, stamps: Array, values: Array) -> "Steps":
-        """Create from stamps (s) and command values (any unit); (n,) each, n > 0."""
+        """Create the command from stamps (s) and command values (any unit); (n,) each, n > 0."""
         changes = np.diff(values)
         return cls(float(values[0]), stamps[1:][changes != 0.0], changes[changes != 0.0])
 
     def integral(self, at: Array, delay: float, squared: float) -> Array:
-        """Time integral of the response, up to a constant; (n,).
+        """Time integral of the response, up to a constant, shape (n,).
 
         Args:
-            at: times (s); (n,).
+            at: times (s), shape (n,).
             delay: dead time plus lag (s).
             squared: square of the lag (s^2); values below 0, which are unphysical, are extrapolated from 0.
         """
@@ -56,7 +56,7 @@ class Steps:
 
 
 def unexplained(measured: Array, *causes: Array) -> Array:
-    """Residual of a measurement after the best linear combination of the causes; (n,) each."""
+    """Residual of a measurement after subtracting the best linear combination of the causes; (n,) each."""
     basis = np.column_stack(causes)
     return np.asarray(measured - basis @ np.linalg.lstsq(basis, measured, rcond=None)[0])
 
@@ -74,13 +74,14 @@ class ResponseFit:
 
     @classmethod
     def of(cls, residuals: Callable[[float, float], Array], wait: float, rounded: float = 0.0) -> "ResponseFit":
-        """Fit by least squares.
+        """Fit the response by least squares.
 
         Args:
-            residuals: from the delay (s) and the square of the lag (s^2), in the order of time; (n,).
-            wait: half the range of the time that commands may have to wait (s); it differs after each start and is
-                uniformly distributed.
-            rounded: maximum apparent squared lag of any other effect (s^2).
+            residuals: function of the delay (s) and the squared lag (s^2); returns residuals in chronological order,
+                shape (n,).
+            wait: half the range of the time that commands may have to wait (s); the wait differs after each start and
+                is uniformly distributed.
+            rounded: maximum apparent squared lag caused by any other effect (s^2).
 
         Raises:
             InputError: the measurement does not depend on the parameters.
@@ -99,10 +100,10 @@ class ResponseFit:
         """Estimates of dead time, lag and delay, as saved.
 
         Args:
-            meanings: meaning of each.
-            covers: errors covered by their intervals.
-            prefix: prefix of their names.
-            key: configuration section for dead time and lag; none if for information only.
+            meanings: meaning of each estimate.
+            covers: errors covered by the intervals.
+            prefix: prefix of the estimates' names.
+            key: configuration section for dead time and lag; empty if they are informational only.
         """
         roots = (math.sqrt(max(x, 0.0)) for x in (self.squared.value, self.squared.low, self.squared.high))
         lag, least, greatest = roots

@@ -1,7 +1,8 @@
 """Turning centres and effective wheel radii of a skid-steer body, from arcs between two rests.
 
-A test stand, or the pose in map, measures the body's position (``--by``). Each arc has one ratio of wheel rates, so its
-motion is the exponential of one twist. Only wheel turns and averaged poses at rest are used, so delays have no effect.
+A test stand, or the pose in the map, measures the body's position (``--by``). Each arc has a constant ratio of wheel
+rates, so its motion is the exponential of one twist. Only wheel turns and averaged poses at rest are used, so delays
+have no effect.
 """
 
 import math
@@ -48,10 +49,10 @@ class SkidArc:
 
     @classmethod
     def of(cls, record: MoveRecord, observer: Observer, chassis: Chassis) -> "SkidArc":
-        """Create it from a move.
+        """Create an arc from a move.
 
         Raises:
-            InputError: too few poses at rest, or a shaft without feedback.
+            InputError: there are too few poses at rest, or a shaft sent no feedback.
         """
         before, after = record.at_rest(OBSERVERS[observer])
         least = 5  # minimum number of poses at each end
@@ -73,7 +74,7 @@ class SkidArc:
 
 @dataclass(frozen=True, slots=True)
 class SlipWizard:
-    """Wizard: arcs in both directions, forward and back."""
+    """Wizard that drives arcs in both directions, forward and back."""
 
     name: ClassVar[WizardName] = "slip"
     doc: ClassVar[str] = (
@@ -122,11 +123,11 @@ def result_of(arcs: Sequence[SkidArc], radius: float, half_track: float) -> Resu
 
     Args:
         arcs: driven arcs.
-        radius: nominal wheel radius, m.
-        half_track: half the track width, m.
+        radius: nominal wheel radius (m).
+        half_track: half the track width (m).
 
     Raises:
-        InputError: too few arcs, or none in one direction.
+        InputError: there are too few arcs, or none in one direction.
     """
     turns = np.array([arc.motion[2] for arc in arcs])
     if len(arcs) < 4 or not ((turns > 0.3).any() and (turns < -0.3).any()):
@@ -189,10 +190,10 @@ def result_of(arcs: Sequence[SkidArc], radius: float, half_track: float) -> Resu
 
 
 def _check_sides(left: Array, right: Array, seen: Array) -> None:
-    """Raise InputError if the sides are swapped, or one turns in the wrong direction.
+    """Raise InputError if the sides are swapped or one of them turns in the wrong direction.
 
     Raises:
-        InputError: the sides are swapped, or one is reversed; the message names the case.
+        InputError: the sides are swapped, or one is reversed; the message says which.
     """
     ahead, turned = np.sign(seen[0]), seen[2]
     sides = {"left": float(ahead @ left), "right": float(ahead @ right)}
@@ -218,7 +219,7 @@ def _mean_pose(poses: Sequence[Pose2D]) -> tuple[float, float, float]:
 
 
 def _spread(poses: Sequence[Pose2D]) -> tuple[float, float]:
-    """Standard errors of a mean pose, m and rad."""
+    """Standard errors of a mean pose (m and rad)."""
     root = math.sqrt(len(poses))
     place = math.hypot(float(np.std([p.x for p in poses])), float(np.std([p.y for p in poses]))) / math.sqrt(2)
     return place / root, float(np.unwrap([p.yaw for p in poses]).std()) / root

@@ -1,10 +1,10 @@
 """Poses of the sonars, their cone angle, and the speed of sound, from arcs next to a flat wall.
 
 A wall reflects the sound along its normal. A range is the sonar's distance from the wall while the normal lies within
-the cone; beyond that, the edge of the cone meets the wall at a slightly larger range. Arcs in both directions turn
-every sonar past the wall and move it towards the wall and away. So they determine the pose of the sonar, the edges of
-its cone and, from one taped distance, the speed of sound. A single circle would not: a rotation of all poses about its
-centre looks like a rotated wall.
+the cone; beyond that, the edge of the cone meets the wall at a slightly larger range. Arcs in both directions sweep
+every sonar past the wall and move it towards and away from the wall. So they determine the pose of the sonar, the edges
+of its cone and, together with one taped distance, the speed of sound. A single circle would not suffice: rotating all
+poses about its centre has the same effect as rotating the wall.
 """
 
 import math
@@ -54,7 +54,7 @@ _WALL: Final = Number("wall", "Distance from the wall to the middle of the robot
 
 
 class SonarPose(NamedTuple):
-    """Pose of one sonar on the body, or of one for each echo (n,), m and rad."""
+    """Pose of one sonar on the body, or one pose for each echo (n,); m and rad."""
 
     x: float | Array
     y: float | Array
@@ -63,7 +63,7 @@ class SonarPose(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class SonarLeg:
-    """One arc: poses of the robot at every ping, and the ranges."""
+    """One arc: robot poses at every ping, and the ranges."""
 
     poses: Mapping[str, Array]
     """Poses by sonar, (n, 3): x, y (m) and yaw (rad) in the frame of the robot as it was parked"""
@@ -72,14 +72,14 @@ class SonarLeg:
 
     @classmethod
     def of(cls, record: MoveRecord, origin: tuple[float, float, float]) -> "SonarLeg":
-        """Create it from a move.
+        """Create an arc from a move.
 
         Args:
             record: record with odometry and sonars.
             origin: odometry pose of the parked robot: x, y (m) and yaw (rad).
 
         Raises:
-            InputError: no odometry.
+            InputError: there is no odometry.
         """
         odometry = record.of(topics.ODOMETRY)
         if len(odometry) < 2:
@@ -106,7 +106,7 @@ class SonarLeg:
 
 @dataclass(frozen=True, slots=True)
 class SonarWizard:
-    """Wizard: an arc in each direction, driven forward and back, next to a wall."""
+    """Wizard that drives an arc in each direction, forward and back, next to a wall."""
 
     name: ClassVar[WizardName] = "sonar"
     doc: ClassVar[str] = "poses and cone angles of the sonars, and the speed of sound, from arcs along a wall"
@@ -163,11 +163,11 @@ def result_of(legs: Sequence[SonarLeg], settings: Srf08Config, wall: float, tape
     Args:
         legs: driven arcs; the first starts where the robot was parked.
         settings: sonar settings used by the daemon.
-        wall: taped distance of the wall from the robot's middle, m.
-        tape_error: standard deviation of ``wall``, m.
+        wall: taped distance between the wall and the robot's middle (m).
+        tape_error: standard deviation of ``wall`` (m).
 
     Raises:
-        InputError: arcs in one direction only, too few echoes, or swapped sonars.
+        InputError: arcs were driven in only one direction, there are too few echoes, or sonars are swapped.
     """
     headings = np.concatenate([p[:, 2] for leg in legs for p in leg.poses.values()] or [np.zeros(1)])
     span = 1.0  # minimum turn in each direction, rad
@@ -211,9 +211,9 @@ def result_of(legs: Sequence[SonarLeg], settings: Srf08Config, wall: float, tape
 
 
 def arc(chassis: Chassis, limit: float) -> tuple[float, float, float]:
-    """Axle angles of an arc to the left (rad) and its radius (m).
+    """Return the axle angles of an arc to the left (rad) and its radius (m).
 
-    With both axles of a truck, or the front axle of another body.
+    A truck steers both axles, another body only the front axle.
     """
     angle = 0.35  # angle of both axles of a truck, in opposite directions, rad
     if isinstance(chassis, TruckChassis):
@@ -227,13 +227,13 @@ def arc(chassis: Chassis, limit: float) -> tuple[float, float, float]:
 def wall_range(
     poses: Array, place: SonarPose, wall: tuple[float | Array, float | Array], half: float
 ) -> tuple[Array, Array]:
-    """Range to a wall, m, and angle of its normal beyond the edge of the cone, rad; (n,) each.
+    """Range to a wall (m), and angle of its normal beyond the edge of the cone (rad); (n,) each.
 
     Args:
-        poses: poses of the robot, (n, 3).
+        poses: robot poses, shape (n, 3).
         place: pose of the sonar.
         wall: distance from the origin (m), and clockwise angle from the x axis (rad).
-        half: half angle of the cone, rad.
+        half: half angle of the cone (rad).
     """
     x, y, yaw = poses.T
     turned = yaw + wall[1]
@@ -246,10 +246,10 @@ def wall_range(
 
 
 def swings(poses: Array) -> Array:
-    """Derivative of the poses of an arc with respect to the relative excess of its turn, to first order; (n, 3).
+    """Derivative of an arc's poses with respect to the relative excess of its turn, to first order; shape (n, 3).
 
     Args:
-        poses: odometry poses x, y (m) and yaw (rad); (n, 3).
+        poses: odometry poses: x, y (m) and yaw (rad), shape (n, 3).
     """
     yaw = poses[:, 2] - poses[0, 2]
     across = (yaw[1:] + yaw[:-1])[:, None] / 2 * np.diff(poses[:, :2], axis=0)
@@ -260,14 +260,14 @@ def swings(poses: Array) -> Array:
 class SonarModel:
     """Model of the ranges to a wall along arcs.
 
-    Parameters: ``COMMON``; for every arc except the first the robot's shift towards the wall (m) and its turn (rad)
-    relative to odometry, and the relative excess of its turn; x, y, yaw of every sonar.
+    Parameters: ``COMMON``; for every arc except the first, the robot's shift towards the wall (m), its turn (rad)
+    relative to odometry, and the relative excess of its turn; x, y and yaw of every sonar.
 
     Args:
         legs: driven arcs.
         settings: sonar settings used by the daemon.
-        wall: taped distance of the wall, m.
-        tape_error: standard deviation of ``wall``, m.
+        wall: taped distance from the wall (m).
+        tape_error: standard deviation of ``wall`` (m).
     """
 
     def __init__(self, legs: Sequence[SonarLeg], settings: Srf08Config, wall: float, tape_error: float) -> None:
@@ -298,11 +298,11 @@ class SonarModel:
         self.kept = self._chosen(self._start, FIRST_RANGE_ERROR, 0.0)
 
     def samples(self, name: str) -> int:
-        """Select a sonar's echoes from the wall."""
+        """Return the number of a sonar's echoes from the wall."""
         return int((self.kept.sonars == self.order.index(name)).sum())
 
     def fit(self) -> FitResult:
-        """Fit by least squares: first the normals within the cones, then also the edges, finally without outliers.
+        """Fit by least squares: first normals within the cones, then also the edges, finally without outliers.
 
         Raises:
             InputError: a sonar has too few echoes.
@@ -315,7 +315,7 @@ class SonarModel:
         return found
 
     def _solve(self, start: Array, *, edges: bool = True) -> FitResult:
-        """Keep the axes and the cone where no edges determine them."""
+        """Fit, keeping the configured axes and cone if no edges determine them."""
         for name in self.order:
             if (count := self.samples(name)) < LEAST_ECHOES:
                 raise InputError(
@@ -327,7 +327,7 @@ class SonarModel:
         return least_squares(self._residual, start, self._start - reach, self._start + reach)
 
     def _predicted(self, parameters: Array, echoes: "_Echoes") -> tuple[Array, Array]:
-        """Predict the ranges of the sonars, m, and the angle of the normal beyond the edge of the cone, rad."""
+        """Predict the sonar ranges (m), and the angle of the normal beyond the edge of the cone (rad)."""
         distance, direction, half, factor, scale = parameters[:COMMON].tolist()
         nearer, turned, swung = self._drift(parameters)[echoes.arcs].T
         x, y, yaw = parameters[self.first :].reshape(-1, 3)[echoes.sonars].T
@@ -336,13 +336,13 @@ class SonarModel:
         return due / factor, past
 
     def _drift(self, parameters: Array) -> Array:
-        """Shift (m), turn (rad) and relative excess of the turn of every arc, (n, 3)."""
+        """Shift (m), turn (rad) and relative excess of the turn for every arc, shape (n, 3)."""
         return np.concatenate((np.zeros(2), parameters[COMMON : self.first])).reshape(-1, len(ASSUMED.sonar_arc))
 
     def _drifted(self, drift: Array) -> Array:
-        """Drift in units of ``ARC_DRIFT``.
+        """Return the drift in units of ``ARC_DRIFT``.
 
-        Shift and turn since the end of the previous arc, and relative excess of the turn; (n, 3).
+        Columns: shift and turn since the end of the previous arc, and relative excess of the turn; shape (n, 3).
         """
         nearer, turned, swung = drift.T
         ends = self._ends + swung[:, None] * self._swings
@@ -365,7 +365,13 @@ class SonarModel:
         return np.concatenate((off, drift.ravel(), believed, [taped]))
 
     def _chosen(self, parameters: Array, bounds: Array | float, beyond: float) -> "_Echoes":
-        """Select echoes at most ``bounds`` (m) from the wall's expected range and ``beyond`` (rad) past the cone."""
+        """Select echoes close to the expected wall.
+
+        Args:
+            parameters: model parameters.
+            bounds: maximum difference from the expected range (m).
+            beyond: maximum angle of the wall's normal beyond the cone (rad).
+        """
         due, past = self._predicted(parameters, self._echoes)
         near = np.abs(self._echoes.ranges - due) < bounds
         near &= (past <= beyond) & (due > self._limits[0]) & (due < self._limits[1])
@@ -374,7 +380,7 @@ class SonarModel:
 
 
 class _Echoes(NamedTuple):
-    """Echoes of all sonars on all arcs; (n,) each."""
+    """Echoes from all sonars on all arcs; (n,) each."""
 
     arcs: NDArray[np.int64]
     sonars: NDArray[np.int64]
@@ -387,10 +393,10 @@ class _Echoes(NamedTuple):
 
 
 def _check_places(legs: Sequence[SonarLeg], places: Mapping[str, SonarPose], wall: float, half: float) -> None:
-    """Refuse a sonar with a wrong axis, judged by the middle of the directions in which it receives the wall.
+    """Reject a sonar whose axis is wrong, judged by the mean direction in which it detects the wall.
 
     Raises:
-        InputError: cables or addresses are swapped, or a sonar receives no wall.
+        InputError: cables or addresses are swapped, or a sonar does not detect the wall.
     """
     wrong, deaf = [], []
     for name in places:
@@ -415,9 +421,9 @@ def _check_places(legs: Sequence[SonarLeg], places: Mapping[str, SonarPose], wal
 
 
 def _bearings(legs: Sequence[SonarLeg], name: str, wall: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Bearing of the wall in the body frame at every ping, rad, and whether the sonar measured a matching range.
+    """Bearing of the wall in the body frame at every ping (rad), and whether the sonar measured a matching range.
 
-    (n,).
+    Both have shape (n,).
     """
     poses = np.concatenate([leg.poses[name] for leg in legs if name in leg.poses] or [np.empty((0, 3))])
     ranges = np.concatenate([leg.ranges[name] for leg in legs if name in leg.poses] or [np.empty(0)])
@@ -430,7 +436,7 @@ def _sigma(ranges: Array) -> Array:
 
 
 def _turned(record: MoveRecord) -> float:
-    """Turn measured by odometry, rad."""
+    """Turn measured by odometry (rad)."""
     yaws = np.unwrap([o.pose.yaw for o in record.of(topics.ODOMETRY)])
     return float(yaws[-1] - yaws[0]) if yaws.size else 0.0
 

@@ -1,11 +1,11 @@
 """Zero and direction of the two servos below the lidar, from the height of its beam and its view of the floor.
 
-The levelling runs as usual: it turns the joints against the tilt measured by the compass. On a level floor the heights
-of the beam at its window, on a wall ahead and on a wall to the left give the tilt of the lidar. Minus the tilt of the
-body, this is the true angle of the joints, so the positions of their servos give the zeros. With wheels on blocks, a
-joint that turns in the right direction keeps the lidar level. A joint that turns the wrong way doubles the tilt of the
-body, so the beam meets the floor at the distance for twice the tilt. A joint that does not turn leaves the single tilt,
-as do two swapped joints.
+Levelling runs as usual: it turns the joints against the tilt measured by the compass. On a level floor, the heights
+of the beam at its window, on a wall ahead and on a wall to the left give the tilt of the lidar. Subtracting the tilt of
+the body gives the true angle of the joints, so the servo positions give the zeros. With wheels on blocks, a joint that
+turns in the correct direction keeps the lidar level. A joint that turns the wrong way doubles the tilt of the body, so
+the beam meets the floor at the distance for twice the tilt. If a joint does not turn, or if the two joints are swapped,
+the lidar has the tilt of the body.
 """
 
 import math
@@ -51,7 +51,7 @@ _SIDE: Final = Confirm("side", "Put the left wheels on blocks instead so that th
 
 
 class RollPitch(NamedTuple):
-    """Two angles, rad, REP 103: pitch nose down, roll right side down positive."""
+    """Two angles (rad, REP 103): pitch is positive with the nose down, roll with the right side down."""
 
     pitch: float
     roll: float
@@ -59,7 +59,7 @@ class RollPitch(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RestMeasurement:
-    """Measurements while the truck stood."""
+    """Measurements while the truck was at rest."""
 
     body: RollPitch
     """Tilt of the body by the compass"""
@@ -74,7 +74,7 @@ class RestMeasurement:
     def of(
         cls, scans: Sequence[LaserScan], tilts: Sequence[Attitude], joints: Sequence[StabiliserFeedback]
     ) -> "RestMeasurement":
-        """Create it from messages.
+        """Create a measurement from messages.
 
         Raises:
             InputError: a servo does not answer.
@@ -99,7 +99,7 @@ class Heights:
 
 @dataclass(frozen=True, slots=True)
 class StabiliserWizard:
-    """Wizard: heights on the level floor, then blocks below the rear wheels, then below the left wheels."""
+    """Wizard that measures on a level floor, then with blocks below the rear wheels, then below the left wheels."""
 
     name: ClassVar[WizardName] = "stabiliser"
     doc: ClassVar[str] = (
@@ -158,12 +158,12 @@ def result_of(
         nose: measurements with the nose low.
         side: measurements with the right side low.
         heights: heights of the beam.
-        walls: distances to the wall ahead and the wall to the left, m.
+        walls: distances to the wall ahead and to the wall on the left (m).
         settings: settings used by the daemon.
-        tape_error: standard deviation of a height, m.
+        tape_error: standard deviation of a height (m).
 
     Raises:
-        InputError: impossible heights, missing blocks, a joint that does not follow, or scans that fit neither
+        InputError: heights are impossible, blocks are missing, a joint does not follow, or the scans fit neither
             direction.
     """
     lies = RollPitch(*beam_tilt((heights.centre, heights.ahead, heights.left), walls))
@@ -214,7 +214,7 @@ def result_of(
 
 
 def _turns(stand: RestMeasurement, flat: RestMeasurement, height: float, axis: int, really: RollPitch) -> int:
-    """Return +1 if a joint turns as its driver reports, -1 if it turns the other way.
+    """Return +1 if a joint turns as its driver reports, -1 if it turns in the opposite direction.
 
     Raises:
         InputError: see ``result_of``.
@@ -273,7 +273,7 @@ def _turns(stand: RestMeasurement, flat: RestMeasurement, height: float, axis: i
 def _on_floor(
     stand: RestMeasurement, flat: RestMeasurement, joints: RollPitch, height: float, direction: float
 ) -> float | None:
-    """Fraction of the beams around ``direction`` (rad) that measure the floor at these joint angles (rad).
+    """Fraction of the beams around ``direction`` (rad) that hit the floor at these joint angles (rad).
 
     None if the floor would be at almost the same distance as the objects seen by a level lidar.
     """
@@ -290,7 +290,10 @@ def _on_floor(
 
 
 def beams_up(body: RollPitch, joints: RollPitch, angles: Array) -> Array:
-    """Rise of beams per metre in the level frame: third row of Ry(p) Rx(r) Ry(a) Rx(b) times (cos, sin, 0); (n,)."""
+    """Rise of each beam per metre in the level frame, shape (n,).
+
+    It is the third row of Ry(p) Rx(r) Ry(a) Rx(b) times (cos, sin, 0).
+    """
     ahead, left = plane_slopes(body.roll, body.pitch, joints.pitch, joints.roll)
     return np.asarray(np.cos(angles) * ahead + np.sin(angles) * left)
 

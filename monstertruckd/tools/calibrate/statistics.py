@@ -1,4 +1,4 @@
-"""Confidence intervals from few measurements."""
+"""Confidence intervals from a small number of measurements."""
 
 import math
 from dataclasses import dataclass
@@ -22,10 +22,10 @@ NORMAL: Final = 1.960
 
 
 def student(freedom: int) -> float:
-    """Half-width of a 95 % interval in standard errors, for a spread with this many degrees of freedom.
+    """Half-width of a 95 % interval in standard errors, for a sample spread with ``freedom`` degrees of freedom.
 
     Raises:
-        ValueError: less than one degree of freedom.
+        ValueError: ``freedom`` is less than one.
     """
     if freedom < 1:
         raise ValueError(f"{freedom} degrees of freedom: expected at least 1")
@@ -54,7 +54,7 @@ class Interval:
         return Interval(self.value, self.half + bound)
 
     def joined(self, half: float) -> "Interval":
-        """Widen by an independent 95 % error of half-width ``half``, added in quadrature."""
+        """Widen by an independent error with a 95 % half-width of ``half``, added in quadrature."""
         return Interval(self.value, math.hypot(self.half, half))
 
     def times(self, factor: float) -> "Interval":
@@ -63,7 +63,7 @@ class Interval:
 
 
 def estimated(name: str, found: Interval, unit: str, samples: int, meaning: str, key: str | None = None) -> Estimate:
-    """Create an estimate from its interval; other arguments as in ``Estimate``."""
+    """Create an estimate from its interval; for the other arguments see ``Estimate``."""
     return Estimate(
         name=name,
         value=found.value,
@@ -77,7 +77,7 @@ def estimated(name: str, found: Interval, unit: str, samples: int, meaning: str,
 
 
 def mean_angle(angles: Array) -> float:
-    """Circular mean of directions, rad."""
+    """Circular mean of directions (rad)."""
     return math.atan2(float(np.sin(angles).mean()), float(np.cos(angles).mean()))
 
 
@@ -95,12 +95,13 @@ def mean_interval(values: ArrayLike, least_error: float = 0.0) -> Interval:
 
 
 def correlation_factor(residuals: Array) -> float:
-    """Inflation of a fit's standard error by correlated errors: root of the integrated autocorrelation, at least 1.
+    """Factor by which correlated errors inflate a fit's standard error; at least 1.
 
-    The sum ends at the first correlation below zero (Sokal's window, simplified).
+    It is the root of the integrated autocorrelation; the sum ends at the first correlation below zero (Sokal's window,
+    simplified).
 
     Args:
-        residuals: (n,), in the order of time.
+        residuals: residuals in chronological order, shape (n,).
     """
     centred = residuals - residuals.mean()
     power = float(centred @ centred)
@@ -116,13 +117,13 @@ def correlation_factor(residuals: Array) -> float:
 
 
 def known_errors(fit: FitResult, freedom: int) -> Array:
-    """Half-widths of the parameters of a fit whose residuals are in units of known errors; (n,).
+    """Half-widths of the intervals of a fit's parameters if the residuals are in units of known errors; shape (n,).
 
     If the measurements disagree by more than the known errors, their spread is used.
 
     Args:
         fit: fit of residuals divided by their standard deviations.
-        freedom: number of measurements, without priors, minus parameters.
+        freedom: number of measurements, not counting priors, minus the number of parameters.
     """
     power = float(np.sum(fit.residuals**2))
     unit = math.sqrt(power / max(1, fit.residuals.size - fit.parameters.size))

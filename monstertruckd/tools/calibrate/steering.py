@@ -1,7 +1,8 @@
 """Centre, direction, travel and pulse map of both steering servos.
 
 Hobby servos have no feedback, so the motion of the truck is the measurement: the compass measures its turn, the drive
-its distance, and a string on the floor shows what neither can see: crabbing, when both axles are off by the same angle.
+its distance, and a string on the floor reveals what neither can measure: crabbing, when both axles are off by the same
+angle.
 """
 
 import math
@@ -62,7 +63,7 @@ CIRCLED: Final = (("the front", (1, 0)), ("the rear", (0, 1)), ("all", (1, -1)))
 
 @dataclass(frozen=True, slots=True)
 class SteeringWizard:
-    """Wizard: short arcs for the directions; then travel, straights along a string, full circles and weaves."""
+    """Wizard that drives short arcs to find directions, then measures travel, straights, full circles and weaves."""
 
     name: ClassVar[WizardName] = "steering"
     doc: ClassVar[str] = "centre, direction, travel and pulses of both axles, from the robot's turns and a string"
@@ -78,7 +79,7 @@ class SteeringWizard:
 
     @property
     def moves(self) -> int:
-        """Number of moves: arcs only, or arcs, travel, straights, circles and weaves."""
+        """Number of moves: either arcs only, or arcs, travel, straights, circles and weaves."""
         arcs = 2 * len(SIDES) * len(AXLES)
         return arcs if self.rough else 3 * arcs + 2 * self._lines + len(CIRCLED) * len(SIDES) + 2 * self.weaves
 
@@ -146,7 +147,7 @@ class SteeringWizard:
     async def _arcs(
         context: WizardContext, maps: Maps, arc: tuple[float, float, float]
     ) -> tuple[list[SteeringRun], list[SteeringRun]]:
-        """Drive arcs in both directions, forward and back, with the front axle and with the rear axle."""
+        """Drive arcs in both directions, forward and back, first with the front axle and then with the rear axle."""
         speed, angle, metres = arc
         found: tuple[list[SteeringRun], list[SteeringRun]] = ([], [])
         for axle, name in enumerate(AXLES):
@@ -160,7 +161,7 @@ class SteeringWizard:
 
     @staticmethod
     async def _travel(context: WizardContext, maps: Maps, model: SteeringModel, first: Maps) -> "list[AxleTravel]":
-        """Find how far each axle follows to each side."""
+        """Find how far each axle follows its commands to each side."""
         speed, metres = (0.1, 0.6)  # speed and length of arcs with the wheels as far over as the gate allows
         limit = context.config.gate.angle
         reached = []
@@ -175,7 +176,7 @@ class SteeringWizard:
         return reached
 
     async def _straights(self, context: WizardContext, maps: Maps) -> list[SteeringRun]:
-        """Drive straight ahead and back, with the wheels set from the left and from the right."""
+        """Drive straight ahead and back, approaching the straight position from the left and from the right."""
         speed, metres = (0.12, 2.0)  # m/s, m
         legs = []
         approach = 0.2
@@ -196,9 +197,9 @@ class SteeringWizard:
     async def _circles(
         context: WizardContext, maps: Maps, model: SteeringModel, first: Maps, travel: "list[AxleTravel]"
     ) -> list[SteeringRun]:
-        """Drive a full turn in each direction with each axle and with both; no slow compass error can falsify it.
+        """Drive a full turn in each direction with each axle and with both; slow compass errors cancel.
 
-        The wheels are turned as far as they follow; the ``first`` maps give the command.
+        The wheels are turned as far as they follow their commands; the ``first`` maps give the command.
         """
         ends = {(reach.axle, reach.sign): reach.sign * (abs(reach.servo) - SHORT) for reach in travel}
         legs = []
@@ -277,7 +278,7 @@ class SteeringWizard:
 
 @dataclass(frozen=True, slots=True)
 class AxleTravel:
-    """Reach of an axle to one side."""
+    """How far an axle steers to one side."""
 
     axle: int
     sign: int
@@ -296,7 +297,7 @@ class AxleTravel:
 
     @classmethod
     def of(cls, axle: int, sign: int, legs: Sequence[SteeringRun], model: SteeringModel, maps: Maps) -> "AxleTravel":
-        """Compute the reach from arcs with strongly turned wheels; ``maps`` give the angle of the other axle."""
+        """Compute the travel from arcs at large steering angles; ``maps`` give the angle of the other axle."""
         reached, meant = np.array([model.reached(leg, maps, axle) for leg in legs]).mean(axis=0).tolist()
         stopped = sign * (meant - reached) > SHORT
         servo = reached if stopped else meant
@@ -307,9 +308,9 @@ class AxleTravel:
         return cls(axle, sign, servo, angle, stopped, half, tuple(legs))
 
     def estimates(self, name: str, centre: float, scale: float, before: Result | None) -> list[Estimate]:
-        """Description of the reach, and the pulse limit, us, if there is a mechanical stop.
+        """Description of the travel, and the pulse limit (us) if there is a mechanical stop.
 
-        A pulse limit set ``before`` hides the stop behind it, and is kept.
+        A pulse limit set ``before`` keeps the axle from reaching the stop, so it is kept.
         """
         side, end = "left" if self.sign > 0 else "right", "max_us" if self.sign * scale > 0 else "min_us"
         value, half = math.degrees(self.axle_angle), math.degrees(self.half)
@@ -341,7 +342,7 @@ class AxleTravel:
 
 
 def turns_plot(legs: Sequence[SteeringRun], model: SteeringModel, maps: Maps) -> Plot:
-    """Plot the turns of all legs by the compass against those by the pulse maps."""
+    """Plot the turns of all legs as measured by the compass against those predicted by the pulse maps."""
     turns, _ = model.predict(legs, maps)
     points = np.degrees(np.column_stack((turns, [leg.turn for leg in legs])))
     same = np.repeat(np.array((points.min(), points.max()))[:, None], 2, axis=1)
@@ -349,12 +350,12 @@ def turns_plot(legs: Sequence[SteeringRun], model: SteeringModel, maps: Maps) ->
 
 
 def _steered(axle: int, angle: float) -> tuple[float, float]:
-    """Angles of the front and rear axle, rad, if only one of them is steered."""
+    """Angles of the front and rear axle (rad) if only one of them is steered."""
     return (angle, 0.0) if axle == 0 else (0.0, angle)
 
 
 def steered_senses(arcs: tuple[list[SteeringRun], list[SteeringRun]]) -> tuple[int, int]:
-    """Return for each axle +1 if it steers as commanded, -1 if it steers the other way.
+    """Return for each axle +1 if it steers as commanded, -1 if it steers in the opposite direction.
 
     Raises:
         InputError: an axle does not turn the truck.
@@ -377,7 +378,7 @@ def steered_senses(arcs: tuple[list[SteeringRun], list[SteeringRun]]) -> tuple[i
 def _rough(
     arcs: tuple[list[SteeringRun], list[SteeringRun]], model: SteeringModel, start: Maps, again: str | None
 ) -> Result:
-    """Directions and rough centres, before compass and drive are calibrated.
+    """Directions and rough centres, used before compass and drive are calibrated.
 
     Args:
         arcs: driven arcs.
@@ -428,7 +429,7 @@ def _deficits(maps: Maps, halves: Array, samples: int, band: str) -> list[Estima
 
     Args:
         maps: fitted maps.
-        halves: half the 95 % intervals; (6,).
+        halves: half-widths of the 95 % intervals, shape (6,).
         samples: number of legs.
         band: coverage of the intervals.
     """

@@ -1,9 +1,10 @@
-"""Model of the truck's turns as a function of the servo pulses: the fit of the steering wizard.
+"""Model of the truck's turns as a function of the servo pulses, fitted by the steering wizard.
 
-Both axles are steered, so a turn depends only on the difference of their angles: wz = v_x (tan front - tan rear) / L.
-Arcs with one axle at a time determine the gain of each, straight runs the difference of their centres. Equal errors of
-both centres make the truck crab without turning, which the compass cannot see. They appear as a sideways offset from a
-string and, if the linkage model is correct, as a small difference between circles to the left and to the right.
+Both axles are steered, so a turn depends only on the difference between their angles:
+wz = v_x (tan front - tan rear) / L. Arcs with one axle at a time determine the gain of each axle; straight runs
+determine the difference between their centres. Equal errors in both centres make the truck crab without turning, which
+the compass cannot see. They appear as a sideways offset from a string and, if the linkage model is correct, as a small
+difference between circles to the left and to the right.
 """
 
 import itertools
@@ -49,7 +50,7 @@ class Maps:
 
     @classmethod
     def of(cls, config: TruckConfig) -> "Maps":
-        """Create it from the configuration.
+        """Create maps from the configuration.
 
         Raises:
             InputError: the truck has no steering.
@@ -68,7 +69,7 @@ class Maps:
 
     @classmethod
     def from_parameters(cls, parameters: Array) -> "Maps":
-        """Create it from (front centre, front scale, rear centre, rear scale) and the fields of the deficit."""
+        """Create maps from (front centre, front scale, rear centre, rear scale) and the fields of the deficit."""
         front, front_scale, rear, rear_scale, *deficit = (float(value) for value in parameters)
         return cls((front, rear), (front_scale, rear_scale), TurnDeficit(*deficit))
 
@@ -79,11 +80,11 @@ class Maps:
         return np.array((*pulses, *astuple(self.deficit)))
 
     def pulses(self, axle: int, servo: Array) -> Array:
-        """Pulses sent by the daemon for servo angles (rad), us."""
+        """Pulses that the daemon sends for servo angles in rad (us)."""
         return np.asarray(self.centres[axle] + self.scales[axle] * np.degrees(servo))
 
     def servo(self, axle: int, pulses: Array) -> Array:
-        """Servo angles for pulses, rad, limited to the range of the linkage."""
+        """Servo angles for the given pulses (rad), limited to the range of the linkage."""
         angles = np.radians((pulses - self.centres[axle]) / self.scales[axle])
         return np.asarray(np.clip(angles, -SERVO_LIMIT, SERVO_LIMIT))
 
@@ -108,7 +109,7 @@ class SteeringRun:
     def of(
         cls, track: MoveRecord, maps: Maps, offset: float | None = None, offset_sigma: float = 0.01
     ) -> "SteeringRun":
-        """Create it from a move driven with the daemon's maps."""
+        """Create a run from a move driven with the daemon's maps."""
         motor, *servos = track.steps()
         turn, noise = track.turn()
         part = abs(math.remainder(turn, 2 * math.pi))
@@ -136,11 +137,11 @@ class SteeringModel:
         return replace(self._linkage, deficit=maps.deficit)
 
     def axle_angle(self, axle: int, servo: float, maps: Maps) -> float:
-        """Angle of an axle at its servo angle, with the other axle straight, rad."""
+        """Angle of an axle (rad) at its servo angle while the other axle is straight."""
         return self.axles(maps).angles(*((servo, 0.0) if axle == 0 else (0.0, servo)))[axle]
 
     def commands(self, servos: Sequence[float], true: Maps, configured: Maps) -> tuple[float, float]:
-        """Axle angles (rad) to command of a daemon with ``configured`` maps, for true servo angles (rad)."""
+        """Axle angles (rad) that make a daemon with ``configured`` maps reach the true servo angles (rad)."""
         front, rear = (float(configured.servo(i, true.pulses(i, np.array(servo)))) for i, servo in enumerate(servos))
         return self.axles(configured).angles(front, rear)
 
@@ -159,16 +160,16 @@ class SteeringModel:
         return turns, np.add.reduceat(forward * np.sin(heading) + sideways * np.cos(heading), starts)
 
     def distance(self, leg: SteeringRun) -> float:
-        """Distance travelled on a leg, m."""
+        """Distance travelled on a leg (m)."""
         return float(np.abs(self.chassis.drivetrain.distance(leg.motor)).sum())
 
     # 0.15: maximum relative difference between a pulse map and the configured one before the measurement
     def fit(self, legs: Sequence[SteeringRun], start: Maps, gain: float = 0.15) -> FitResult:
-        """Fit the pulse maps to all legs; parameters as in ``Maps.parameters``.
+        """Fit the pulse maps to all legs; for the parameters see ``Maps.parameters``.
 
         Args:
             legs: driven legs.
-            start: first guess, with correct directions.
+            start: initial guess, with correct directions.
             gain: relative prior uncertainty of the scales.
         """
         guess = start.parameters
@@ -195,7 +196,7 @@ class SteeringModel:
         return least_squares(residual, guess, guess - spread, guess + spread)
 
     def reached(self, leg: SteeringRun, maps: Maps, axle: int) -> tuple[float, float]:
-        """Return the true servo angle of an axle on a leg, from the turn, and the angle that its pulses command, rad.
+        """Return an axle's true servo angle on a leg, computed from the turn, and the angle its pulses command (rad).
 
         The other axle is assumed to follow the maps. Valid for a leg with constant steering.
         """
@@ -219,7 +220,7 @@ class SteeringModel:
 def half_widths(fit: FitResult, priors: int = 9) -> Array:
     """Half-widths of the parameters' 95 % intervals.
 
-    The errors of a leg are known beforehand; if the legs disagree by more, their spread is used.
+    The errors of a leg are known in advance; if the legs disagree by more, their spread is used.
 
     Args:
         fit: result of ``SteeringModel.fit``.

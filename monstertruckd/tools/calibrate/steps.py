@@ -22,7 +22,7 @@ M = TypeVar("M", bound=Message)
 
 @dataclass(slots=True)
 class MoveRecord:
-    """Readings of one move, including the rests at both ends."""
+    """Readings from one move, including the rests at its start and end."""
 
     drive: list[DriveFeedback] = field(default_factory=list)
     steering: list[SteeringFeedback] = field(default_factory=list)
@@ -45,12 +45,12 @@ class MoveRecord:
         return list(self.others.get(topic.name, ()))
 
     def at_rest(self, topic: Topic[M]) -> tuple[list[M], list[M]]:
-        """Return the topic's messages before the start and after the arrival."""
+        """Return the topic's messages from before the start and from after the arrival."""
         found = self.of(topic)
         return [m for m in found if m.stamp < self.left], [m for m in found if m.stamp > self.arrived]
 
     def distance(self, drivetrain: DriveTrain) -> float:
-        """Distance rolled by the wheels, from the drive's position (m); negative backwards."""
+        """Distance rolled by the wheels, computed from the drive's position (m); negative when reversing."""
         if len(self.drive) < 2:
             return 0.0
         return float(drivetrain.distance(self.drive[-1].position - self.drive[0].position))
@@ -61,7 +61,7 @@ class MoveRecord:
         return (self.drive[-1].position - self.drive[0].position) / (2 * math.pi)
 
     def headings(self) -> Array:
-        """Unwrapped headings, clockwise (rad); (n,)."""
+        """Unwrapped headings, clockwise (rad), shape (n,)."""
         return np.unwrap([reading.heading for reading in self.attitude])
 
     def turned(self) -> float:
@@ -69,10 +69,10 @@ class MoveRecord:
         return float(-(self.headings()[[0, -1]] @ (-1, 1))) if len(self.attitude) > 1 else 0.0
 
     def turn(self) -> tuple[float, float]:
-        """Turn between the rests (rad, left positive), and its standard error from noise alone.
+        """Turn between the rests (rad, left positive), and its standard error due to noise alone.
 
         Raises:
-            InputError: too few headings at rest.
+            InputError: there are too few headings at rest.
         """
         headings = self.headings()
         stamps = np.array([reading.stamp for reading in self.attitude])
@@ -86,7 +86,7 @@ class MoveRecord:
         return float(before.mean() - after.mean()), noise
 
     def currents_at(self, stamps: Array) -> Array:
-        """Motor current (A) at the given times (ns); 0 if the nearest reading is half a second or more away; (n,)."""
+        """Motor current (A) at the given times (ns), shape (n,); 0 if no reading is within half a second."""
         known = [(reading.stamp, reading.current) for reading in self.drive if reading.current is not None]
         if not known:
             return np.zeros(stamps.shape)
@@ -96,7 +96,7 @@ class MoveRecord:
         return np.where(nearest < 0.5 * SECOND, np.interp(stamps, times, values), 0.0)
 
     def steps(self) -> tuple[Array, Array, Array]:
-        """Motor rotation between readings (rad), and both servo angles at that time (rad); (n,) each."""
+        """Motor rotation between readings (rad), and both servo angles at the time of each reading (rad); (n,) each."""
         stamps = np.array([reading.stamp for reading in self.drive], dtype=np.float64)
         motor = np.diff([reading.position for reading in self.drive])
         middle = (stamps[1:] + stamps[:-1]) / 2
@@ -123,7 +123,7 @@ class Number:
 
 @dataclass(frozen=True, slots=True)
 class Confirm:
-    """A confirmation by the operator: an action done, or an observation."""
+    """Confirmation by the operator of a completed action or of an observation."""
 
     name: str
     question: str
@@ -137,7 +137,7 @@ class Confirm:
 class MoveStep:
     """A drive from rest to rest, with fixed or weaving steering; the truck is disarmed before and after.
 
-    The wheels turn while the truck stands. It rests for a moment at both ends, so that readings there can be averaged.
+    The wheels steer while the truck stands. The truck rests briefly at both ends so that readings can be averaged.
     """
 
     name: str
@@ -163,12 +163,12 @@ class MoveStep:
     """Whether the operator measures from the start, so that the move cannot be repeated once the truck has moved"""
 
     def back(self, distance: float) -> "MoveStep":
-        """Return the reverse of the move over ``distance`` (m); straight back for a weaving move."""
+        """Return the reverse of the move over ``distance`` (m); for a weaving move, straight back."""
         back = replace(self, name=f"{self.name}, back", speed=-self.speed, metres=distance, done=None, also=())
         return replace(back, front=0.0, rear=0.0, weave=()) if self.weave else back
 
     def side(self, seconds: float) -> int:
-        """Sign of the axle angles, ``seconds`` after the start."""
+        """Sign of the axle angles ``seconds`` after the start."""
         if not self.weave:
             return 1
         ends = list(itertools.accumulate(self.weave))
@@ -179,7 +179,7 @@ class MoveStep:
 
 @dataclass(frozen=True, slots=True)
 class Collect(Generic[M]):
-    """Collects ``count`` messages of a topic while the truck stands."""
+    """Collects ``count`` messages of a topic while the truck is at rest."""
 
     name: str
     topic: Topic[M]
@@ -190,7 +190,7 @@ class Collect(Generic[M]):
 
 @dataclass(frozen=True, slots=True)
 class WatchStep(Generic[M]):
-    """Follows the messages of a topic while the operator acts, until the data suffices.
+    """Follows the messages of a topic while the operator acts, until there is enough data.
 
     If several messages arrive while one is processed, only the latest is used.
     """
@@ -206,7 +206,7 @@ class WatchStep(Generic[M]):
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """Measurements of a wizard, and the fit to them."""
+    """Measurements from a wizard, and the fit to them."""
 
     name: str
     x: str
@@ -223,13 +223,13 @@ class Panel(Protocol):
     """Operator interface of a wizard: a terminal, a script, or a simulated operator."""
 
     def say(self, text: str) -> None:
-        """Show a sentence."""
+        """Show a message."""
 
     def progress(self, name: str, done: float, total: float) -> None:
         """Show the progress of a step."""
 
     def plot(self, plot: Plot) -> None:
-        """Show measurements; replaces the previous plot."""
+        """Show measurements in place of the previous plot."""
 
     async def number(self, step: Number) -> float:
         """Ask for a number.
@@ -239,4 +239,4 @@ class Panel(Protocol):
         """
 
     async def confirm(self, step: Confirm) -> bool:
-        """Ask for a confirmation. Raises as ``number`` does."""
+        """Ask for a confirmation. Raises the same errors as ``number``."""

@@ -1,12 +1,12 @@
-"""Dead time and lag of the steering from a weaving truck: the gate's commands against the turns of the compass.
+"""Dead time and lag of the steering from a weaving truck, fitted to the gate's commands and the turns of the compass.
 
 The integral of the lagged curvature times the speed is the expected turn of the compass. Each weave has its own gain
 (the linkage may turn less than expected) and trim (the axles may be off centre).
 
 The accelerometers of the compass mistake starting (2 degrees in the first 0.1 s at speed) and turning (0.1 degrees to
-either side) for tilt. Levelling the field by such a tilt changes the heading by half as much again, depending on the
-direction of north, which looks like another delay and less lag. So headings are computed from the field with one tilt
-for the whole weave; the floor is level.
+either side) for tilt. Levelling the field by such a tilt changes the heading by one and a half times as much, depending
+on the direction of north, which looks like a different delay and less lag. So headings are computed from the field with
+a single tilt for each weave; the floor is level.
 """
 
 from collections.abc import Iterable, Sequence
@@ -60,7 +60,7 @@ class Weave:
 
     @classmethod
     def of(cls, record: MoveRecord, chassis: TruckChassis, iron: IronConfig) -> Self | None:
-        """Create it from readings at speed; None if they are too few."""
+        """Create a weave from readings at speed; None if there are too few."""
         times = np.array([reading.stamp for reading in record.drive]) / SECOND
         speeds = np.abs([reading.velocity for reading in record.drive])
         # 0.9: minimum fraction of the maximum speed for readings apart from start and stop
@@ -86,7 +86,7 @@ class Weave:
         )
 
     def residuals(self, delay: float, squared: float) -> Array:
-        """Residuals of the turns for the best gain and trim, rad; arguments as for ``Steps.integral``."""
+        """Residuals of the turns for the best gain and trim (rad); for the arguments see ``Steps.integral``."""
         turned = (
             np.diff(self.curvature.integral(self.times, delay, squared)) / np.diff(self.times) * np.diff(self.distances)
         )
@@ -97,10 +97,10 @@ class Weave:
 
 
 def steady_headings(readings: Sequence[Attitude], iron: IronConfig) -> Array:
-    """Headings of a body with constant tilt, whatever its accelerometers report: clockwise, rad, unwrapped; (n,).
+    """Clockwise, unwrapped headings (rad) of a body with constant tilt, whatever its accelerometers report; shape (n,).
 
     Args:
-        readings: readings in order; without a field, the heading of the compass is used.
+        readings: readings in chronological order; without a field, the heading of the compass is used.
         iron: magnetic calibration of the unit.
     """
     fields = [(field.x, field.y, field.z) for reading in readings if (field := reading.magnetic_field) is not None]
@@ -121,7 +121,7 @@ def response(records: Iterable[MoveRecord], chassis: TruckChassis, iron: IronCon
         iron: magnetic calibration used by the compass driver.
 
     Raises:
-        InputError: too few turns were measured.
+        InputError: there are too few turns were measured.
     """
     seen = [weave for record in records if (weave := Weave.of(record, chassis, iron)) is not None]
     samples = sum(weave.turns.size for weave in seen)
@@ -136,7 +136,7 @@ def response(records: Iterable[MoveRecord], chassis: TruckChassis, iron: IronCon
 
 
 def estimates(found: ResponseFit) -> list[Estimate]:
-    """Estimates as saved."""
+    """Estimates in the form in which they are saved."""
     meanings = (
         "from a command to the first movement of the wheels",
         "time constant of the turning wheels",

@@ -1,9 +1,9 @@
 """Calibration wizards: coroutines that lead the operator through typed steps.
 
 A wizard awaits the steps of its ``WizardContext`` one by one: ask for a number, ask for a confirmation, move, collect
-messages, fit. It can be cancelled at every step. The truck moves within ``move`` only and is disarmed between moves,
-and nothing is written before the wizard returns its result. An interrupt, a lost link or a killed process leaves the
-calibration unchanged; the gate stops the truck as for any operator whose requests end.
+messages, fit. It can be cancelled at every step. The truck moves only within ``move`` and is disarmed between moves.
+Nothing is written before the wizard returns its result, so an interrupt, a lost link or a killed process leaves the
+calibration unchanged; the gate stops the truck, as it does for any operator whose requests end.
 """
 
 import json
@@ -49,14 +49,14 @@ class Wizard(Protocol):
 
 
 class WizardContext:
-    """Steps of one wizard, and its data of the truck.
+    """Steps of one wizard, and the truck data it uses.
 
     Args:
         truck: link to the truck.
         panel: interface to the operator.
         clock: source of time.
-        config: configuration of the daemon, calibration included.
-        known: the truck's calibration so far, by wizard; expired results, and results of another part, are ignored.
+        config: configuration of the daemon, including the calibration.
+        known: the truck's calibration so far, by wizard; expired results and results for another part are ignored.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class WizardContext:
         self._moves, self._moved = 0, 0
 
     def say(self, text: str) -> None:
-        """Show a sentence to the operator."""
+        """Show a message to the operator."""
         self._panel.say(text)
 
     def plot(self, plot: Plot) -> None:
@@ -124,11 +124,11 @@ class WizardContext:
         return yes
 
     def expect(self, moves: int) -> None:
-        """Number the next ``moves`` moves in the messages to the operator."""
+        """Set the total for the numbering of the next ``moves`` moves in messages to the operator."""
         self._moves, self._moved = moves, 0
 
     async def move(self, step: MoveStep) -> MoveRecord:
-        """Drive; raises the errors of ``Mover.move``."""
+        """Drive; raises the same errors as ``Mover.move``."""
         self._moved += 1
         which = f" ({self._moved} of {self._moves})" if self._moved <= self._moves else ""
         self._panel.say(f"moving{which}: {step.name}")
@@ -147,7 +147,7 @@ class WizardContext:
         """Collect messages of a topic.
 
         Raises:
-            NoAnswerError: too few were received in time.
+            NoAnswerError: there are too few messages arrived in time.
         """
         found: list[M] = []
         with self._truck.subscribe(step.topic, fifo(step.count)) as messages:
@@ -162,10 +162,10 @@ class WizardContext:
         return found
 
     async def watch(self, step: WatchStep[M]) -> None:
-        """Follow messages until ``step.take`` has seen enough; raises its errors.
+        """Follow messages until ``step.take`` has received enough; raises the same errors as ``step.take``.
 
         Raises:
-            NoAnswerError: no message was received in time.
+            NoAnswerError: no message arrived in time.
         """
         with ExitStack() as feeds:
             newest = feeds.enter_context(self._truck.subscribe(step.topic, latest()))
@@ -183,7 +183,7 @@ class WizardContext:
         """Compute a result from the measurements, as a separate step.
 
         Raises:
-            InputError: the measurements do not determine a result; and errors of ``function``.
+            InputError: the measurements do not determine a result. Errors raised by ``function`` are passed on.
         """
         self._panel.say(f"computing: {name}")
         try:
@@ -234,7 +234,7 @@ async def save(truck: TruckClient, result: Result) -> tuple[Result, str]:
 
 
 def missing(config: TruckConfig, results: Mapping[str, Result], expired: Collection[str] = ()) -> list[WizardRun]:
-    """Return the runs of wizards that a robot still needs, ordered so that each can use earlier results.
+    """Return the wizard runs that a robot still needs, ordered so that each can use earlier results.
 
     Args:
         config: configuration of the robot.

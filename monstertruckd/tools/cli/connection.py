@@ -35,7 +35,7 @@ def with_robot(
         main: coroutine that uses the robot.
         robot: name of the robot.
         endpoint: address of the robot.
-        timeout: timeout for the link and for answers, s.
+        timeout: timeout for the link and for answers (s).
         named: whether to print the robot's name and host first; False for commands that only read or print it
             themselves.
 

@@ -31,7 +31,7 @@ async def find_cable(role: str, machine: Machine, say: Callable[[str], None], ti
         role: device at the cable, for the messages and the baud rate.
         machine: computer whose ports are watched.
         say: shows one line to the user.
-        timeout: timeout for unplugging and for plugging in, s.
+        timeout: timeout for unplugging and for plugging in (s).
 
     Raises:
         NoAnswerError: no cable was unplugged in time.

@@ -41,7 +41,7 @@ WIDE_CELL: Final = 48
 
 
 def on_terminal(stream: TextIO | None) -> bool:
-    """Whether a standard stream is a terminal; the stream is None if it was closed before the start."""
+    """Return whether a standard stream is a terminal; the stream is None if it was closed before the start."""
     return stream is not None and stream.isatty()
 
 
@@ -118,7 +118,7 @@ def print_table(
 
 
 def _has_room(lines: Sequence[Sequence[str]]) -> bool:
-    """Whether the last column of a table fits into a terminal, or folds into readable lines."""
+    """Return whether the last column of a table fits into a terminal, or folds into readable lines."""
     *others, last = zip(*lines, strict=True)
     room = shutil.get_terminal_size().columns - sum(max(map(len, column)) + 2 for column in others)
     longest_word = max((len(word) for cell in last for word in cell.split()), default=0)

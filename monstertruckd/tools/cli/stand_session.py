@@ -172,7 +172,7 @@ def clocks_apart(ways: Iterable[int]) -> int:
 
 
 def stand_pose(pose: "RobotPose", now: int, count: int, stamp: int) -> "StandPose":
-    """The message of a pose; times by the robot's clock, ns."""
+    """The message of a pose; times by the robot's clock (ns)."""
     from monstertruck_schemas.base import Pose2D
     from monstertruck_schemas.sensor import StandPose
 

@@ -109,7 +109,7 @@ def analyse_command(
 
 
 def _results(runs: "list[Run]") -> "list[Result]":
-    """Results of the runs; runs without a result, such as one stopped at once, are reported and skipped.
+    """Results of the runs; runs without a result, such as one stopped immediately, are reported and skipped.
 
     Raises:
         InputError: no run has a result.

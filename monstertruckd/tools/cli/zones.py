@@ -148,7 +148,7 @@ def area_of(corners: list[str], limit: float | None, inside: Literal["stop", "le
 
 
 def row_of(zone: "Zone", *, inside: bool, now: int) -> tuple[str, ...]:
-    """Row of a table; ``now`` is the robot's time, ns."""
+    """Row of a table; ``now`` is the robot's time (ns)."""
     from monstertruck_runtime.clock import SECOND
 
     if zone.mask is None:

@@ -160,7 +160,7 @@ def run_fast_exploration(config_file: Path, folder: Path, seed: int | None, repo
 
 
 def seeks(config: SimulatedTruckConfig) -> bool:
-    """Whether the robot searches for a tag: its world has some, and it keeps points of interest."""
+    """Return whether the robot searches for a tag: its world has some, and it keeps points of interest."""
     return config.points is not None and bool(config.sim.world.tags)
 
 

@@ -40,7 +40,7 @@ class Account:
     """Names and numbers."""
 
     def may_use(self, file: Path) -> bool:
-        """Whether the account may read and write the file; for a folder, whether it may create files in it."""
+        """Return whether the account may read and write the file; for a folder, whether it may create files in it."""
         try:
             status = file.stat()
         except OSError:
@@ -49,7 +49,7 @@ class Account:
         return self.uid == 0 or self._allowed(status) & needed == needed
 
     def may_read(self, file: Path) -> bool:
-        """Whether the account may read the file; parent folders are not checked."""
+        """Return whether the account may read the file; parent folders are not checked."""
         try:
             return self.uid == 0 or bool(self._allowed(file.stat()) & 0o4)
         except OSError:
@@ -205,7 +205,7 @@ class HostContext:
         return next((pid for pid, words in self._processes() if _runs_daemon(words)), None)
 
     def runs(self, name: str) -> bool:
-        """Whether a process of that name runs."""
+        """Return whether a process of that name runs."""
         return any(text_of(file) == name for file in (self.system / "proc").glob("[0-9]*/comm"))
 
     def _processes(self) -> Iterator[tuple[int, list[str]]]:

@@ -19,7 +19,7 @@ class Unrevealed(NamedTuple):
     """Limit of the effect."""
 
     def holds(self, family: str) -> bool:
-        """Whether this entry describes a family."""
+        """Return whether this entry describes a family."""
         return any(fnmatchcase(family, pattern) for pattern in self.families)
 
 

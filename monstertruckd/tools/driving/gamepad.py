@@ -106,7 +106,7 @@ class PadMapping(Schema):
     buttons: dict[Button, Action] = Field(default_factory=lambda: dict(USUAL))
 
     def fits(self, name: str) -> bool:
-        """Whether the mapping applies to a device of this name."""
+        """Return whether the mapping applies to a device of this name."""
         return fnmatch(name, self.name)
 
 
@@ -173,7 +173,7 @@ class Pad:
         return self._any_of(self.mapping.deadman)
 
     def _any_of(self, names: tuple[Button, ...]) -> bool:
-        """Whether any of these buttons is held."""
+        """Return whether any of these buttons is held."""
         held = any(BUTTONS[name] in self._pressed for name in names)
         return held or any(self._axes.get(AXES[name], -1.0) > HALF for name in names if name in AXES)
 

@@ -85,7 +85,7 @@ def run_command(arguments: Sequence[str]) -> str:
 
 
 def runs_here(root: Path) -> bool:
-    """Whether systemd runs the system below ``root``: it is not an image, a chroot or a container."""
+    """Return whether systemd runs the system below ``root``: it is not an image, a chroot or a container."""
     return root == Path("/") and below(root, BOOTED).is_dir()
 
 

@@ -188,7 +188,7 @@ def record_type(annotation: Any) -> type[BaseModel] | None:
 
 
 def _is_plain(annotation: Any) -> bool:
-    """Whether a type is a record or an optional record, not a list of records."""
+    """Return whether a type is a record or an optional record, not a list of records."""
     return all(option is type(None) or isinstance(option, type) for option in (get_args(annotation) or (annotation,)))
 
 

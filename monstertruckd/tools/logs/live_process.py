@@ -51,7 +51,7 @@ async def show_live(
 
 
 async def listens(viewer: str) -> bool:
-    """Whether a viewer answers at an address."""
+    """Return whether a viewer answers at an address."""
     place = urlsplit(viewer)
     try:
         async with asyncio.timeout(LISTENER_LOOK_PERIOD):

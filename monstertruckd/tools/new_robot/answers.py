@@ -155,7 +155,7 @@ class Answers(Schema):
 
 
 def asked(name: str, answers: dict[str, Any]) -> bool:
-    """Whether a question matters after the answers so far."""
+    """Return whether a question matters after the answers so far."""
     lidar = str(answers.get("lidar", NONE))
     match name:
         case "beams" | "field_of_view" | "range_max" | "direction" | "scan_rate":

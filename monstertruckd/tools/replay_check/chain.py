@@ -134,7 +134,7 @@ def without_goals(config: TruckConfig) -> TruckConfig:
 
 
 def period_of(planner: PlannerConfig) -> int:
-    """Return the period of the goal service's ticks, ns."""
+    """Return the period of the goal service's ticks (ns)."""
     return round(SECOND / planner.rate)
 
 
@@ -220,7 +220,7 @@ class Chain:
             raise first_of(group, BaseException) or group from None
 
     async def take(self, topic: Topic[Message], message: Message, log_time: int) -> None:
-        """Deliver an input recorded at ``log_time``, ns."""
+        """Deliver an input recorded at ``log_time`` (ns)."""
         await self._catch_up(log_time)
         if topic is topics.SCAN:
             assert isinstance(message, LaserScan)
@@ -262,7 +262,7 @@ class Chain:
         self._answering = output.topic != topics.SLAM.name
 
     async def finish(self, end: int) -> None:
-        """Let workers run until ``end``, ns."""
+        """Let workers run until ``end`` (ns)."""
         await self._catch_up(end)
 
     @property
@@ -271,12 +271,12 @@ class Chain:
         return isinstance(self._scans, TiltStamper)
 
     def ticks(self, output: LogMessage) -> bool:
-        """Whether a recorded message reveals a tick of a service."""
+        """Return whether a recorded message reveals a tick of a service."""
         called = output.topic == topics.PATH.name and _near(self._called, output.stamp) is not None
         return called or self._writer_of(output) in self._paces
 
     def takes(self, topic: str) -> bool:
-        """Whether a recorded message is an input."""
+        """Return whether a recorded message is an input."""
         return topic in self._inputs
 
     def as_computed(self, topic: Topic[Message], message: Message, payload: bytes) -> bytes:
@@ -295,7 +295,7 @@ class Chain:
         return SERVICES.get(output.topic, output.topic)
 
     def _is_start(self, output: LogMessage) -> bool:
-        """Whether it is the goal service's first report, sent before its first tick."""
+        """Return whether it is the goal service's first report, sent before its first tick."""
         return output.topic == topics.GOAL.name and output.stamp == self._goal_record.start
 
     def _turn_of(self, service: str, output: LogMessage) -> int:
@@ -363,7 +363,7 @@ class Chain:
 
 
 def _near(instants: Sequence[int], stamp: int) -> int | None:
-    """Return the instant, of an increasing sequence, that a stamp belongs to, ns."""
+    """Return the instant, of an increasing sequence, that a stamp belongs to (ns)."""
     at = bisect_left(instants, stamp - TOGETHER)
     return instants[at] if at < len(instants) and instants[at] <= stamp + TOGETHER else None
 

@@ -48,7 +48,7 @@ def differences(before: Message, after: Message) -> list[Difference]:
 
 
 def same_header(before: Message, after: Message) -> bool:
-    """Whether stamps and sequence numbers are equal."""
+    """Return whether stamps and sequence numbers are equal."""
     return all(getattr(before, name) == getattr(after, name) for name in HEADER)
 
 
@@ -105,7 +105,7 @@ def _distance(a: Sequence[float], b: Sequence[float]) -> float:
 
 
 def _same(a: Any, b: Any) -> Any:
-    """Whether both are equal or NaN; of arrays for each element."""
+    """Return whether both are equal or NaN; of arrays for each element."""
     return (a == b) | ((a != a) & (b != b))  # NaN alone differs from itself
 
 
@@ -196,7 +196,7 @@ class TopicComparison:
     Args:
         topic: row of the topic table.
         tolerance: maximum difference of an agreeing field, SI units; 0: equal bit for bit.
-        begin: start of the log, ns.
+        begin: start of the log (ns).
         judged: whether a difference matters.
     """
 
@@ -239,11 +239,11 @@ class TopicComparison:
         return len(self._recorded)
 
     def surplus(self, end: int) -> int:
-        """Return the number of unrecorded outputs of the replay until ``end``, ns."""
+        """Return the number of unrecorded outputs of the replay until ``end`` (ns)."""
         return sum(output.time <= end for output in self._again.values())
 
     def agrees(self, end: int) -> bool:
-        """Whether every output until ``end`` (ns) was reproduced within the tolerance."""
+        """Return whether every output until ``end`` (ns) was reproduced within the tolerance."""
         return not self.judged or self.differing == self.missing == self.surplus(end) == 0
 
     def within(self, end: int, limit: float) -> bool:

@@ -144,7 +144,7 @@ class GoalRecord:
         return found
 
     def unknown_waypoints(self, period: int) -> bool:
-        """Whether a remote call had waypoints: reports give only their number."""
+        """Return whether a remote call had waypoints: reports give only their number."""
         goals = {number for number, call in self.calls(period).items() if isinstance(call.what, Pose2D)}
         return any(one.sequence in goals and one.state.waypoints for one in self.reports)
 
@@ -165,13 +165,13 @@ class GoalRecord:
 
 
 def asks_standstill(entry: LogMessage) -> bool:
-    """Whether the goal service made a drive request, not the tracker."""
+    """Return whether the goal service made a drive request, not the tracker."""
     request = entry.decode()
     return isinstance(request, DriveRequest) and request.source == SOURCE
 
 
 def is_deformed(entry: LogMessage) -> bool:
-    """Whether a path came from deformation rather than from a tick of the goal service."""
+    """Return whether a path came from deformation rather than from a tick of the goal service."""
     path = entry.decode()
     return isinstance(path, Path) and re.fullmatch(DEFORMED, path.name) is not None
 

@@ -133,7 +133,7 @@ class RunLog:
 
 
 def _alike(one: Identity, other: Identity) -> bool:
-    """Whether two parts agree in their common data; damaged data is ignored."""
+    """Return whether two parts agree in their common data; damaged data is ignored."""
     return one[0] == other[0] and all(one[1][name] == other[1][name] for name in one[1].keys() & other[1].keys())
 
 

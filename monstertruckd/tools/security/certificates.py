@@ -98,13 +98,13 @@ def seconds_left(certificate: x509.Certificate, now: int) -> int:
 
     Args:
         certificate: certificate to examine.
-        now: real time, s.
+        now: real time (s).
     """
     return round(certificate.not_valid_after_utc.timestamp()) - now
 
 
 def began(certificate: x509.Certificate) -> int:
-    """Return the start of a certificate's validity, real time, s."""
+    """Return the start of a certificate's validity, real time (s)."""
     return round(certificate.not_valid_before_utc.timestamp())
 
 
@@ -113,7 +113,7 @@ def new_authority(name: str, now: int, days: int) -> Certificate:
 
     Args:
         name: common name.
-        now: real time, s.
+        now: real time (s).
         days: validity.
     """
     key = ec.generate_private_key(ec.SECP256R1())
@@ -134,8 +134,8 @@ def issue(issuer: Certificate, name: str, now: int, seconds: int, *, server: Seq
     Args:
         issuer: signing authority.
         name: common name.
-        now: real time, s.
-        seconds: validity, s.
+        now: real time (s).
+        seconds: validity (s).
         server: addresses and host names used by stations; none for a station.
     """
     key = ec.generate_private_key(ec.SECP256R1())

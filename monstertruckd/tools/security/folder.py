@@ -155,7 +155,7 @@ class Folder:
             robot: name of the robot; None, here and below, keeps the value; initially truck.
             addresses: addresses of the robot, for stations; initially those of this computer.
             place: folder of the robot's files on the robot.
-            now: real time, s.
+            now: real time (s).
             days: validity of the robot's certificate.
 
         Raises:
@@ -196,7 +196,7 @@ class Folder:
             name: common name, and the source of its requests.
             role: its role; None keeps it, initially pilot.
             rank: its maximum priority; None keeps it, initially station.
-            now: real time, s.
+            now: real time (s).
             days: validity of its certificate.
 
         Raises:
@@ -275,14 +275,14 @@ class Folder:
         return load(*self._files("authority"))
 
     def issuer(self, name: str) -> Certificate:
-        """Return the issuer of a station's certificate. Raises the errors of ``authority``."""
+        """Return the issuer of a station's certificate. Raises the same errors as ``authority``."""
         return load(*self._files(f"issuers/{name}"))
 
     def certificates(self, now: int) -> list[Expiry]:
         """Return all certificates with their remaining days.
 
         Args:
-            now: real time, s.
+            now: real time (s).
         """
         register = self.register()
         rows = [

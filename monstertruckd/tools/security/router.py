@@ -35,7 +35,7 @@ def make_router(
         path: folder of the router's authority.
         robots: folders of the robots' authorities.
         addresses: addresses of the router, for robots and stations; robots use the first one.
-        now: real time, s.
+        now: real time (s).
         place: folder of the router's files.
         port: its port.
 

@@ -71,7 +71,7 @@ def load_robot(path: Path) -> tuple[TruckConfig, Tree]:
 
 
 def needs_computer(config: SimulatedTruckConfig) -> bool:
-    """Whether the daemon needs an emulated computer, for USB devices or for monitors."""
+    """Return whether the daemon needs an emulated computer, for USB devices or for monitors."""
     return hangs_by_hub(config.devices) or config.monitors != Monitors()
 
 

@@ -99,12 +99,12 @@ class Lap:
 
     @property
     def seconds(self) -> float:
-        """Duration, s."""
+        """Duration (s)."""
         return (self.end - self.start) / SECOND
 
     @property
     def cross_track_rms(self) -> float:
-        """Root mean square distance from the path, m."""
+        """Root mean square distance from the path (m)."""
         return float(np.sqrt(np.mean(self.cross_track**2))) if len(self.cross_track) else 0.0
 
 

@@ -59,7 +59,7 @@ class EmulatedRoom:
     Args:
         world: world with the robot.
         clock: source of time.
-        body: length and width of the robot, m.
+        body: length and width of the robot (m).
     """
 
     def __init__(self, world: World, clock: Clock, body: tuple[float, float]) -> None:

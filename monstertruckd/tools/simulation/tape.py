@@ -22,7 +22,7 @@ class EmulatedTape:
     Args:
         world: world with the robot.
         clock: source of time.
-        body: length and width of the robot, m.
+        body: length and width of the robot (m).
         say: receives measurements, one per line.
     """
 
@@ -53,8 +53,8 @@ def measured(mark: TruthState, now: TruthState, length: float, width: float) -> 
     Args:
         mark: state when mark and string were laid.
         now: state at the measurement.
-        length: length of the body, m.
-        width: width of the body, m.
+        length: length of the body (m).
+        width: width of the body (m).
     """
     (ahead, left), (_, side) = (_moved(mark, now, *place) for place in ((length / 2, 0.0), (0.0, width / 2)))
     turn = math.degrees(math.remainder(now.yaw - mark.yaw, math.tau))
@@ -70,7 +70,7 @@ def _meter(now: TruthState) -> str:
 
 
 def _moved(mark: TruthState, now: TruthState, x: float, y: float) -> tuple[float, float]:
-    """Return the displacement of a point of the body, ahead and left, m; x and y from the body's centre, m."""
+    """Return the displacement of a point of the body, ahead and left, m; x and y from the body's centre (m)."""
     ahead, left = to_body(mark.yaw, now.x - mark.x, now.y - mark.y)
     now_x, now_y = to_world(now.yaw - mark.yaw, x, y)
     return ahead + now_x - x, left + now_y - y

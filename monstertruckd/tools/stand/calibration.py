@@ -79,7 +79,7 @@ def place(lens: Lens, seen: Mapping[int, Array], marks: Mapping[int, MarkConfig]
     """Return the pose of one camera from marks at known places.
 
     Raises:
-        InputError: too few of them are visible.
+        InputError: there are too few of them are visible.
     """
     known = sorted(seen.keys() & marks.keys())
     if len(known) < LEAST_MARKS:

@@ -129,7 +129,7 @@ class Identities:
         return AT_START + pair.off if seconds > UNSURE and not self._alike[name] else None
 
     def _may_be_another(self, name: str, stamp: int, pair: Pair) -> bool:
-        """Whether a robot that was out of sight for long may be another one that looks the same."""
+        """Return whether a robot that was out of sight for long may be another one that looks the same."""
         if self._long_gone(name, stamp) and not self._at_start(name, pair):
             others = {
                 o for o in self._alike[name] if self._long_gone(o, stamp) and self._cost(o, stamp, pair) is not None

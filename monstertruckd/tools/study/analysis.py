@@ -66,7 +66,7 @@ def circle(times: Array, poses: Array) -> Circle:
         poses: shape (3, n).
 
     Raises:
-        InputError: too few poses, numbers that are not finite, or hardly any turn.
+        InputError: there are too few poses, numbers that are not finite, or hardly any turn.
     """
     times, poses = _checked(times, poses)
     at, heading = times - times[0], np.unwrap(poses[2])
@@ -117,7 +117,7 @@ def line(times: Array, poses: Array, directions: Array) -> StraightPasses:
         directions: shape (n,), sign of the commanded speed at each pose, 0 where none was commanded.
 
     Raises:
-        InputError: too few poses, numbers that are not finite, no pass long enough, or one without way.
+        InputError: there are too few poses, numbers that are not finite, no pass long enough, or one without way.
     """
     times, poses = _checked(times, poses)
     heading = np.unwrap(poses[2])

@@ -37,7 +37,7 @@ def as_values(results: Sequence[Result], radius: float, half_track: float) -> di
 
     Args:
         results: results of ``analyse``.
-        radius: radius of the wheels, nominal, m.
+        radius: radius of the wheels, nominal (m).
         half_track: m.
     """
     circles = [_circle(run, found, radius, half_track) for run, found in results if isinstance(found, Circle)]

@@ -124,7 +124,7 @@ async def _tuned(
 
 
 def _calm(wanted: float, samples: Samples) -> bool:
-    """Whether the robot keeps its distance."""
+    """Return whether the robot keeps its distance."""
     calm_for = 2.0  # minimum time of the error below 2 cm, s
     newest = [measured for at, measured in samples if at >= samples[-1][0] - calm_for]
     # 0.02: distance error below which a robot is ready for a run, m
@@ -132,7 +132,7 @@ def _calm(wanted: float, samples: Samples) -> bool:
 
 
 def _over(wanted: float, seconds: float, samples: Samples) -> bool:
-    """Whether a run is complete, or has to be broken off."""
+    """Return whether a run is complete, or has to be broken off."""
     return samples[-1][0] >= seconds or abs(samples[-1][1] - wanted) > LOST
 
 

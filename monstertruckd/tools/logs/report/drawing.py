@@ -221,7 +221,7 @@ def timeline(run: RunSummary) -> str:
 
 
 def _always_ready(track: StateTrack) -> bool:
-    """Whether a service started, was ready, and ended with the daemon; its row is not shown."""
+    """Return whether a service started, was ready, and ended with the daemon; its row is not shown."""
     return track.worst is not Tone.NONE and [s.text for s in track.spans if s.text not in {"starting", "stopped"}] in (
         ["ready"],
         [],
