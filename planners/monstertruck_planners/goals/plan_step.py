@@ -536,9 +536,10 @@ class PlanningStep:
         )
 
     def _closed_cells(self, shape: tuple[int, ...], resolution: float, origin: Pose2) -> NDArray[np.bool_] | None:
-        """Return the grid cells closed to reversing, within ``BESIDE`` of closed places; None without any."""
+        """Return the cells closed to reversing, which reach to ``BESIDE`` from those of closed places; None if none."""
         closed = marked(np.zeros(shape, np.bool_), self._closed, resolution, origin)
-        return np.asarray(distance_transform_edt(~closed) * resolution < BESIDE) if closed.any() else None
+        reach = BESIDE + resolution / 2  # from the middle of a closed cell, as a footprint meets a cell at its middle
+        return np.asarray(distance_transform_edt(~closed) * resolution < reach) if closed.any() else None
 
     def _standing(self, static_map: StaticMap, cells: Cells, pose: Pose2) -> RouteMap:
         """Return the map with free ground under the truck, padded in case the truck is at its edge."""

@@ -71,7 +71,7 @@ class Unseen:
             # Mean speed along a route (m/s), used to estimate its time of arrival at a place.
             unseen = left < SOON + along / 0.1
             along_body, beside_body = beyond(self.footprint, pose[None], places[unseen])
-            covered = (along_body < BESIDE) & (beside_body < -self.footprint.padding)
+            covered = (along_body < BESIDE) & (beside_body < 0.0)
             if direction < 0 and covered.any():
                 # 0.6: unseen ground within this distance (m) of the reverse motion is closed to the next route: one
                 # truck length, since a route next to it would not be better

@@ -91,6 +91,16 @@ def test_where_the_body_stood_and_what_was_seen_lately_may_be_reversed_onto():
             assert (answer.path.directions < 0).all()
 
 
+def test_the_route_around_unseen_ground_ends_its_reverse_motions_before_the_edge():
+    """Otherwise the next routes back onto the edge again, and it drives to a viewpoint instead of to the goal."""
+    goal = (1.4, 1.5, math.pi)
+    answer, _ = planned(goal, survey())
+    assert answer.path is not None
+    assert (answer.path.directions < 0).any()
+    assert not len(backed_onto(answer.path, survey()))
+    assert math.dist(answer.path.poses[-1, :2], goal[:2]) < 0.05
+
+
 def test_before_a_wall_with_nothing_seen_behind_the_goal_is_refused_with_place_and_remedy():
     room = np.full((60, 100), 0)
     room[:, 47:] = 100  # x = 2.35: the bumper is nearer than the margin
@@ -138,11 +148,12 @@ def test_a_path_backs_onto_unseen_ground_beyond_where_it_began(legs, met):
 
 
 @pytest.mark.parametrize(
-    ("behind", "beside", "met"), [(0.8, 0.0, True), (1.2, 0.0, False), (-1.0, 0.8, False), (-1.0, -1.0, True)]
+    ("behind", "beside", "met"), [(0.8, 0.0, True), (1.2, 0.0, False), (-1.0, 0.8, False), (-1.0, -0.2, True)]
 )
 def test_a_reverse_motion_ends_where_the_gate_would_stop_before_unseen_ground(behind, beside, met):
-    """The gate looks along the motion: ground beside the body does not stop it."""
+    """The gate looks along the motion: ground beside the body does not stop it, ground within its padding does."""
     assert BESIDE == DRIFT
+    assert FOOTPRINT.padding > 0.2 * DRIFT
     side = 0.0 if behind > 0 else FOOTPRINT.half_width
     places = np.array([(HERE[0] - 0.2 - BACK - behind * DRIFT, HERE[1] + side + beside * DRIFT)])
     unseen = Unseen(places, np.zeros(1), LIDAR, FIELD, 4.0, FOOTPRINT)
