@@ -142,7 +142,8 @@ class ObstacleGuard:
         self.unseen: float | None = 0.0
         """Age of the oldest view of a sector of travel at the latest scan, s; None if a sector was never seen."""
         self.known = math.inf
-        """Distance to unseen ground that stops the latest checked motions, m; +inf if none is within reach."""
+        """Distance to unseen ground that stops the latest checked motions, less the memory's doubt about the travelled
+        distance, m; +inf if none is within reach."""
         self.known_slowly = math.inf
         """Distance to unseen ground that only slows these motions, m; +inf if none is within reach."""
         self._checked: frozenset[_Steps] | None = None
@@ -307,20 +308,27 @@ class ObstacleGuard:
         before_it, beside = 0.3, 0.1
         stretch = np.array((beside / before_it, 1.0))
         near = on_body(self._footprint, measured, self._reach + before_it) & ~on_body(self._footprint, measured, 0.0)
+        recalled = False  # whether the memory decides about ground that stops one of the motions
         for twist in twists:
             sweep = self._sweep(*twist)
             unknown = self._unknown(twist, sweep.ground)
             ground, before = sweep.ground[unknown], sweep.before[unknown]
+            recalled |= not _is_ahead(twist)
             if _is_turn(twist, self._footprint):
                 self._free = float(before[_near(ground, measured[near], depth)].min(initial=self._free))
             elif twist[0] < 0 or _is_sideways(twist, self._footprint):
                 self._stop_before(twist, before)
                 continue
             elif _is_ahead(twist):
-                in_front = ground[:, 0] > self._footprint.offset + self._footprint.half_length
-                tail = _near(ground * stretch, measured[near] * stretch, beside)
-                self._stop_before(twist, before[in_front | tail])
+                hidden = ~self.looks_at(sweep.ground)
+                aside = sweep.ground[hidden]
+                in_front = aside[:, 0] > self._footprint.offset + self._footprint.half_length
+                stopping = in_front | _near(aside * stretch, measured[near] * stretch, beside)
+                recalled |= bool(stopping.any())
+                self._stop_before(twist, sweep.before[hidden][stopping & unknown[hidden]])
             self.known_slowly = float(before.min(initial=self.known_slowly))
+        if recalled and self.memory.unsure:
+            self.known = max(min(self.known, self._reach) - self.memory.unsure, 0.0)
 
     def _stop_before(self, twist: _Steps, before: Array) -> None:
         """Shorten ``known`` to the minimum of the distances along a motion, refined to the edge of seen ground."""
@@ -351,9 +359,7 @@ class ObstacleGuard:
 
     def allowed_before_unseen(self, now: int) -> float:
         """Maximum pace that allows a comfortable stop on seen ground (m/s)."""
-        unsure = self.memory.unsure
-        known = self.known if not unsure else min(self.known, self._reach) - unsure
-        return comfortable_speed(known - DRIFT, self.delay(now), self._limits.config.obstacle.deceleration)
+        return comfortable_speed(self.known - DRIFT, self.delay(now), self._limits.config.obstacle.deceleration)
 
     def allowed_speed(self, free: float, now: int) -> float:
         """Maximum pace that allows a comfortable stop within ``free`` metres (m/s)."""
@@ -478,6 +484,8 @@ class ObstacleCheck(Check):
             yield Measurement(name="unseen", value=self.guard.unseen, unit="s", limit=config.scan.stale_after)
         elif reason is Reason.UNSEEN_STOP:
             yield Measurement(name="seen distance", value=_finite(self.guard.known), unit="m", limit=DRIFT)
+            if self.guard.memory.unsure:
+                yield Measurement(name="travel doubt", value=_finite(self.guard.memory.unsure), unit="m")
         elif reason is Reason.OBSTACLE_STOP:
             yield self._approach.free_distance(max((one for one in ages if one is not None), default=None))
 

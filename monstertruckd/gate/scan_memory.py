@@ -179,13 +179,17 @@ class ScanMemory:
         self._ticks.append((now, self._pose, self._travelled))
 
     def doubt(self, place: tuple[float, float], covariance: Array) -> None:
-        """Process the pose of the base in odometry.
+        """Process the pose of the base in odometry; forget everything if a number is not finite.
 
         Args:
             place: x and y (m).
             covariance: covariance of (x, y, yaw), row-major, shape (9,), m^2, m rad, rad^2.
         """
-        self._odometry = np.concatenate((place, covariance))
+        odometry = np.concatenate((place, covariance))
+        if np.isfinite(odometry).all():
+            self._odometry = odometry
+        else:
+            self.forget()
 
     def rest(self, scan: LaserScan | None) -> None:
         """Process a scan from a robot at rest; discard the memory if the robot was carried.
@@ -220,7 +224,7 @@ class ScanMemory:
             taken.append(self._newest)
         _keep(eye.views, self._newest)
         grown = [abs(self._travel_doubt - view.doubt) for view in self._seeing(self._newest)]
-        self.unsure = max(max(grown) - self._footprint.padding, 0.0)
+        self.unsure = max(max(grown, default=math.inf) - self._footprint.padding, 0.0)
         self._points = self._hidden(self._newest)
 
     def moved(self, points: Array, lidar: int) -> Array:

@@ -16,9 +16,9 @@ from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.sensor import HIDDEN, DriveMode
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.config import GateConfig, InForce
-from monstertruckd.gate.obstacles import ObstacleGuard, at_poses
+from monstertruckd.gate.obstacles import ObstacleCheck, ObstacleGuard, at_poses
 from monstertruckd.gate.scan_memory import DRIFT, MAP_CELL, MAP_SIZE, ScanMemory, elsewhere, spaced
-from tests.unit.gate.rig import TICK, Rig, scan
+from tests.unit.gate.rig import TICK, Rig, check_of, scan
 
 FOOTPRINT = Footprint()
 BACK = FOOTPRINT.half_length - FOOTPRINT.offset
@@ -603,6 +603,26 @@ def test_in_reverse_a_drive_that_reports_less_than_it_turns_does_not_pass_the_ed
     assert rig.x > -DRIFT
 
 
+@pytest.mark.parametrize("shown", [0.7, 0.9])
+def test_ahead_a_drive_that_reports_less_than_it_turns_is_not_limited_where_the_lidar_looks(shown):
+    rig = surround(Rig(disarm_after=5.0))
+    rig.shown = shown
+    rig.driving(ticks=500, speed=0.2)
+    assert check_of(rig.gate, ObstacleCheck).guard.memory.unsure > 0.0
+    assert rig.out.reasons == ()
+    assert rig.out.speeds[0] == pytest.approx(0.2)
+
+
+def test_a_stop_before_unseen_ground_names_the_doubt_about_the_travelled_distance():
+    rig = surround(Rig(disarm_after=5.0)).driving(ticks=200, speed=0.2)
+    rig.driver, rig.shown = {"speed": -0.15}, 0.3
+    rig.tick(400)
+    distance, doubt = check_of(rig.gate, ObstacleCheck).figures(Reason.UNSEEN_STOP, rig.now)
+    assert 0.0 <= distance.value <= 2 * DRIFT
+    assert (doubt.name, doubt.unit) == ("travel doubt", "m")
+    assert doubt.value > 0.05
+
+
 def test_remembered_obstacles_are_nearer_by_the_doubt_about_the_travelled_distance_beyond_the_padding():
     def beside(doubt):
         guard, now = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, [ScanPoints(MOUNT)]), SECOND
@@ -797,6 +817,18 @@ def test_an_error_of_the_heading_from_before_a_scan_moves_no_ground_that_it_saw(
     remembered.doubt((7.0 + dx, -3.0 + dy), lost.moved(dx, dy).plus((0, 0, 0, 0, 0, gained**2)).matrix().ravel())
     see(remembered, now)
     assert seen(remembered, -BACK - 0.3) is known
+
+
+@pytest.mark.parametrize("unknown", [math.nan, math.inf])
+def test_a_pose_that_is_no_number_makes_everything_unseen(unknown):
+    remembered = memory()
+    see(remembered, SECOND)
+    now = drive(remembered, 0.4)
+    for odometry in (((0.0, unknown), np.zeros(9)), ((0.0, 0.0), np.full(9, unknown))):
+        remembered.doubt(*odometry)
+        see(remembered, now)
+        assert not seen(remembered, -BACK - 0.2)
+        assert remembered.unsure == 0.0
 
 
 def test_what_a_truck_that_stands_sees_does_not_age():
