@@ -151,6 +151,8 @@ class ScanMemory:
     def forget(self) -> None:
         """Discard everything, because the motion of the body is unknown."""
         self._pose: Pose2 = (0.0, 0.0, 0.0)
+        self._placed = self._pose
+        """Pose at the latest odometry."""
         self._travelled = 0.0
         poses_kept = 64  # number of ticks whose pose is kept, to place a scan where it was taken
         self._ticks: deque[tuple[int, Pose2, float]] = deque(maxlen=poses_kept)
@@ -179,17 +181,18 @@ class ScanMemory:
         self._ticks.append((now, self._pose, self._travelled))
 
     def doubt(self, place: tuple[float, float], covariance: Array) -> None:
-        """Process the pose of the base in odometry; forget everything if a number is not finite.
+        """Process the pose of the base in odometry; forget everything if it is not finite or jumps.
 
         Args:
             place: x and y (m).
             covariance: covariance of (x, y, yaw), row-major, shape (9,), m^2, m rad, rad^2.
         """
         odometry = np.concatenate((place, covariance))
-        if np.isfinite(odometry).all():
-            self._odometry = odometry
-        else:
+        jump = math.dist(place, self._odometry[:2]) - math.dist(self._pose[:2], self._placed[:2])
+        if not np.isfinite(odometry).all() or jump > math.sqrt(self._variance_kept):
             self.forget()
+        if np.isfinite(odometry).all():
+            self._odometry, self._placed = odometry, self._pose
 
     def rest(self, scan: LaserScan | None) -> None:
         """Process a scan from a robot at rest; discard the memory if the robot was carried.
@@ -349,6 +352,12 @@ class ScanMemory:
             (seen,) = self._free((view,), there)
             ages[seen] = min(100 * max(newest.beams.stamp - view.beams.stamp, 0) // self._time, 100)
             yield
+        unseen = ages.reshape(MAP_SIZE, MAP_SIZE) < 0
+        for _ in range(math.ceil(min(self.unsure / MAP_CELL, MAP_SIZE))):
+            for cells in (unseen, unseen.T):
+                cells[1:] |= cells[:-1]
+                cells[:-1] |= cells[1:]
+        ages[unseen.ravel()] = -1
         return GroundSurvey(newest.beams.stamp, ages.reshape(MAP_SIZE, MAP_SIZE))
 
     def _free(self, taken: Sequence[_Taken], there: Array) -> NDArray[np.bool_]:

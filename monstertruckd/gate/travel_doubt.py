@@ -15,6 +15,7 @@ class TravelDoubt:
 
     A drive that follows its commands turns its shaft at a speed commanded within its reaction time, once it has
     accelerated. Any other measured speed leaves two possible distances, and nothing in the gate tells which is true.
+    Readings that are too slow and readings that are too fast cancel, as those of a constant offset do back and forth.
 
     Args:
         limits: limits in force.

@@ -831,6 +831,34 @@ def test_a_pose_that_is_no_number_makes_everything_unseen(unknown):
         assert remembered.unsure == 0.0
 
 
+@pytest.mark.parametrize("variance", [0.0, 0.04])
+def test_odometry_whose_place_jumps_makes_everything_unseen(variance):
+    for restarts in (False, True):
+        remembered = ScanMemory(FOOTPRINT, [MOUNT], 2.0, 30.0, 0.1)
+        remembered.doubt((20.0, 0.0), np.diag((0.04, 0.04, 0.0)).ravel())
+        remembered.doubt((20.0, 0.0), np.diag((0.04, 0.04, 0.0)).ravel())
+        see(remembered, SECOND)
+        now = drive(remembered, 0.05)
+        if restarts:
+            remembered.doubt((0.0, 0.0), np.diag((variance, variance, 0.0)).ravel())
+        see(remembered, now)
+        assert seen(remembered, -BACK - 0.05) is not restarts
+
+
+def test_a_survey_shrinks_by_the_doubt_about_the_travelled_distance():
+    def cells(doubt):
+        remembered = memory()
+        see(remembered, SECOND)
+        now = SECOND + TICK
+        remembered.move(now, (0.2, 0.0, 0.0), 0.02, doubt)
+        see(remembered, now)
+        return surveyed(remembered)
+
+    certain, doubtful = cells(0.0), cells(FOOTPRINT.padding + 0.12)
+    assert (doubtful.ages < 0).sum() > (certain.ages < 0).sum()
+    assert (certain.ages[doubtful.ages >= 0] >= 0).all()
+
+
 def test_what_a_truck_that_stands_sees_does_not_age():
     remembered = memory()
     for second in range(1, 41):
