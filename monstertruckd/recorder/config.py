@@ -67,7 +67,7 @@ class BlackBoxConfig(Schema):
     interval: Annotated[float, Field(ge=0)] = 60.0
     """Minimum interval between boxes of one reason (s); an earlier trip waits for it, at most ``before``."""
     unless: Annotated[tuple[Reason, ...], Field(strict=False)] = (Reason.STOPPED, Reason.DISARMED)
-    """Reasons that write no box; by default those ordered by an operator."""
+    """Reasons that write no box; by default an ordered stop and an ordered disarm."""
 
 
 class MapRender(Schema):

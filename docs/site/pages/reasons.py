@@ -13,7 +13,7 @@ def page() -> Page:
         "Reasons and exit codes",
         join(
             "# Reasons and exit codes",
-            "Each code belongs to one reason, except 0, which all reasons of success share; it is never reassigned. "
+            "Codes are never reassigned. All successes share 0, and a few related reasons share a code. "
             "`monstertruckd reasons` prints the same table. Remedies: [What to do when ...](what-to-do.md).",
             table(("code", "reason", "what"), rows),
         ),

@@ -105,7 +105,7 @@ class SlamConfig(Schema):
     map_period: Positive = 10.0
     """Maximum delay before a changed map is published as a whole (s)"""
     slew: tuple[Positive, Positive] = (0.3, 0.5)
-    """Maximum rate at which the pose in map follows corrections (m/s, rad/s); it never jumps."""
+    """Maximum rate at which the pose in map follows corrections below ``jump`` (m/s, rad/s)"""
     jump: Positive = 1.0
     """Minimum size of corrections that are applied immediately (m)"""
     deviation: tuple[Positive, Positive] = (0.1, 0.05)
