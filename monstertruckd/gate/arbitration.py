@@ -58,9 +58,7 @@ class Source:
     inside: bool
     """Whether the source is a planner of the robot."""
     held: bool = False
-    """Sources that were live at the STOP order or have been neutral since, least recent first; None without a STOP
-    order.
-    """
+    """Whether the source must send a neutral request before it may drive."""
 
     @property
     def key(self) -> Key:
