@@ -3,6 +3,7 @@
 A step's input is a ``WorkerInput``, its output a ``WorkerOutput``; the first input carries the configuration.
 """
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -126,10 +127,21 @@ class SlamWorker:
 
 
 def _same_field(scan: ScanInput, other: ScanInput) -> bool:
-    """Whether two scans of one mount begin and end within a beam of each other; their numbers of beams may differ."""
+    """Whether two scans of one mount cover the same directions: whole circles, or ends within a beam of each other.
+
+    Their numbers of beams may differ. A head that turns endlessly may begin its revolution at any beam.
+    """
+    if scan.mount != other.mount:
+        return False
+    if _is_whole_circle(scan) and _is_whole_circle(other):
+        return True
     width = max(abs(scan.angle_increment), abs(other.angle_increment))
-    ends = zip(_ends(scan), _ends(other), strict=True)
-    return scan.mount == other.mount and all(abs(one - two) <= width for one, two in ends)
+    return all(abs(one - two) <= width for one, two in zip(_ends(scan), _ends(other), strict=True))
+
+
+def _is_whole_circle(scan: ScanInput) -> bool:
+    """Whether no beam fits between the last and the first one."""
+    return (len(scan.ranges) + 1) * abs(scan.angle_increment) > math.tau
 
 
 def _ends(scan: ScanInput) -> tuple[float, float]:

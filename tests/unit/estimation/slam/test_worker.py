@@ -30,9 +30,9 @@ WALLS = np.array(
 )
 
 
-def cast(pose: np.ndarray) -> np.ndarray:
-    direction = np.stack((np.cos(pose[2] + ANGLES), np.sin(pose[2] + ANGLES)), axis=-1)
-    best = np.full(len(ANGLES), np.inf)
+def cast(pose: np.ndarray, angles: np.ndarray = ANGLES) -> np.ndarray:
+    direction = np.stack((np.cos(pose[2] + angles), np.sin(pose[2] + angles)), axis=-1)
+    best = np.full(len(angles), np.inf)
     for x0, y0, x1, y1 in WALLS:
         edge, to = np.array((x1 - x0, y1 - y0)), np.array((x0, y0)) - pose[:2]
         cross = direction[:, 0] * edge[1] - direction[:, 1] * edge[0]
@@ -186,6 +186,20 @@ def test_scans_with_a_few_beams_more_or_less_are_matched():
         assert output.refused is None
     assert output.estimate is not None
     assert np.hypot(*(np.array(output.estimate.pose[:2]) - pose_at(29)[:2])) < 0.05
+
+
+def test_whole_circles_of_different_speed_and_first_beam_are_matched():
+    worker, rng = SlamWorker(), np.random.default_rng(3)
+    worker.step(WorkerInput(start=Start(SlamConfig(), tuple(pose_at(0).tolist()))))
+    for i in range(30):
+        count = 606 if i == 0 else 500 + i % 5  # the first revolution while the head still accelerates
+        step = math.tau / count
+        angles = rng.uniform(-math.pi, math.pi) + step * np.arange(count)
+        ranges = cast(pose_at(i), angles) + rng.normal(0, 0.01, count)
+        whole = replace(scan_at(i, rng), ranges=ranges, start_angle=angles[0], angle_increment=step)
+        assert worker.step(WorkerInput(scan=whole)).refused is None
+    half = replace(whole, stamp=whole.stamp + SECOND, ranges=ranges[:250])
+    assert str(worker.step(WorkerInput(scan=half)).refused).startswith("another geometry: 250 beams")
 
 
 @pytest.mark.parametrize("rates", [(1.1, 2.7), (0.5, 1.2)])
