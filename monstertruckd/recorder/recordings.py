@@ -124,7 +124,7 @@ class Recordings:
         async with self._reading:
             await self._clock.sleep(max(self._free - self._clock.now(), 0) / SECOND)
 
-            def read() -> tuple[str, int, int]:
+            def read() -> tuple[str, int, Recording]:
                 path, row = self._find(payload)
                 try:
                     with path.open("rb") as file:
@@ -133,14 +133,14 @@ class Recordings:
                         data = file.read(65_536)
                 except OSError as error:
                     raise InputError(f"recording {row.name}: cannot be read: {error.strerror}") from error
-                return base64.b64encode(data).decode(), len(data), row.bytes
+                return base64.b64encode(data).decode(), len(data), row
 
-            text, size, whole = await self._offload(read)
+            text, size, row = await self._offload(read)
             now = self._clock.now()
             # Maximum total download rate (bytes/s).
             self._free = max(self._free, now) + round(size / 1_000_000.0 * SECOND)
-            self._until = now + round(TURN * SECOND) if offset + size < whole else now
-        return {"data": text, "bytes": whole}
+            self._until = now + round(TURN * SECOND) if offset + size < row.bytes else now
+        return {"data": text, "bytes": row.bytes, "open": row.open}
 
     async def _delete(self, payload: dict[str, Any]) -> dict[str, Any]:
         by = str(payload.get("source", ""))

@@ -14,7 +14,7 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import NotFoundError, NotPermittedError, RequestRefusedError, TruckError
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.station.address import RobotAddress
-from monstertruckd.station.recordings import fetch_recording
+from monstertruckd.station.recordings import Fetched, fetch_recording
 
 log = logging.getLogger(__name__)
 
@@ -66,7 +66,7 @@ async def download(
 
 async def fetch(
     address: RobotAddress, name: str, user: str, clock: Clock, to: Path, progress: Callable[[float], object]
-) -> None:
+) -> Fetched:
     """Fetch a recording into a file, resuming a partial one; calls ``progress`` with the fraction fetched.
 
     Raises:
@@ -74,7 +74,7 @@ async def fetch(
         TruckError: the robot refuses or is absent.
     """
     async with _session(address, user, clock) as truck:
-        await fetch_recording(truck, name, to, progress, LARGEST_RECORDING)
+        return await fetch_recording(truck, name, to, progress, LARGEST_RECORDING)
 
 
 def _session(address: RobotAddress, user: str, clock: Clock) -> TruckClient:

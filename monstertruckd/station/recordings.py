@@ -2,6 +2,7 @@
 
 import base64
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -10,10 +11,19 @@ from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.threads import in_thread
 
 
+@dataclass(frozen=True, slots=True)
+class Fetched:
+    """A recording that was fetched to the end it had then."""
+
+    bytes: int
+    open: bool
+    """Whether the robot was still writing it."""
+
+
 async def fetch_recording(
     truck: TruckClient, name: str, to: Path, progress: Callable[[float], object], most: int | None = None
-) -> int:
-    """Fetch a recording into a file, resuming an earlier part; return its size in bytes.
+) -> Fetched:
+    """Fetch a recording into a file, resuming an earlier part.
 
     The robot limits the rate.
 
@@ -45,7 +55,7 @@ async def fetch_recording(
         at += len(data)
         progress(at / max(size, 1))
         if at >= size:
-            return size
+            return Fetched(size, answer.get("open", False))
         if not data:
             raise NotFoundError(f"{name}: became shorter while it was fetched")
 

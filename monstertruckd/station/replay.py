@@ -94,12 +94,13 @@ class ReplayFeed:
         file: log file.
         open_log: function that opens logs.
         clock: clock of the station.
+        growing: whether the robot was still writing the log: a missing end is no damage then.
 
     Raises:
         InputError: the file is not a log, contains nothing to show, or is too large.
     """
 
-    def __init__(self, name: str, file: Path, open_log: LogOpener, clock: Clock) -> None:
+    def __init__(self, name: str, file: Path, open_log: LogOpener, clock: Clock, growing: bool = False) -> None:
         self.name = name
         self.robot = name.partition(" ")[0]
         self.map = MapStore()
@@ -113,7 +114,8 @@ class ReplayFeed:
         self._sampler = Sampler(lambda topic: self._plotted[topic].last(self._at))
         reader = open_log(file)
         self._begin, self._end = self._fill(reader, file)
-        self._fault = reader.fault
+        self._fault = None if growing else reader.fault
+        self._growing = growing
         pose = topics.POSE if self._tracks[topics.POSE.name].times else topics.ODOMETRY
         self._shown = [*((row.topic.name, row) for row in SHOWN), (pose.name, POSE)]
         self._facts = _facts(reader)
@@ -264,6 +266,7 @@ class ReplayFeed:
             playing=self._playing,
             rate=self._rate,
             fault=self._fault,
+            growing=self._growing,
         )
 
     def _send_state(self) -> None:

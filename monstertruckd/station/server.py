@@ -312,9 +312,9 @@ class Station:
             def progress(share: float) -> None:
                 viewer.show("fetching", frames.text("fetching", name=name, share=round(share, 3)))
 
-            await fetch(address, name, user, self._clock, file, progress)
+            fetched = await fetch(address, name, user, self._clock, file, progress)
             try:
-                feed = await in_thread(lambda: ReplayFeed(title, file, open_log, self._clock))
+                feed = await in_thread(lambda: ReplayFeed(title, file, open_log, self._clock, fetched.open))
             finally:  # recordings that cannot be shown would fill the disk
                 file.unlink(missing_ok=True)
             self.replays[title] = feed

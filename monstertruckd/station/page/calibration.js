@@ -122,7 +122,10 @@ export class Calibration {
     byId("wizards").replaceChildren(...this.wizards.map(({ id, name, rough, doc, due, options = [] }) => {
       const start = element("button", { textContent: words(rough ? "wizard.rough" : "wizard.start", { name }), className: due ? "go" : "" });
       const fields = options.map((option) => field(id, option));
-      start.onclick = () => this.order("start", { step: id, options: Object.fromEntries(fields.flatMap(({ given }) => given())) });
+      start.onclick = async () => {
+        await this.order("start", { step: id, options: Object.fromEntries(fields.flatMap(({ given }) => given())) });
+        byId("wizard").scrollIntoView({ block: "nearest" });
+      };
       const more = fields.length ? [element("details", {}, element("summary", { textContent: words("wizard.options") }), ...fields.map(({ row }) => row))] : [];
       return element("li", {}, start, element("small", { textContent: `${due ? `${words("wizard.due")} ` : ""}${doc}` }), ...more);
     }));
@@ -140,6 +143,7 @@ export class Calibration {
   show({ step, phase, said, progress, plot, question, measured, text }) {
     const runs = phase === "running";
     byId("wizard").hidden = phase === "idle";
+    if (question && this.asked !== question.text) requestAnimationFrame(() => byId("wizard-ask").scrollIntoView({ block: "nearest" }));
     byId("wizards").hidden = runs || phase === "measured";
     byId("wizard-name").textContent = words(`wizard.${phase}`, { name: step.split(".")[0] });
     byId("wizard-said").replaceChildren(...said.map((line) => element("li", { textContent: line })));

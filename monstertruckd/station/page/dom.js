@@ -37,6 +37,25 @@ export function element(name, fields = {}, ...children) {
   return made;
 }
 
+/**
+ * Let people type a name as they write it: blanks become dashes and, where names have small letters, capitals small ones.
+ *
+ * @param {string} id of the field, whose pattern the names have
+ * @param {() => void} changed
+ */
+export function nameField(id, changed) {
+  const field = byId(id);
+  field.oninput = () => {
+    const typed = field.pattern.includes("A-Z") ? field.value : field.value.toLowerCase();
+    const [value, at] = [typed.replace(/\s/g, "-"), field.selectionStart];
+    if (value !== field.value) {
+      field.value = value;
+      field.setSelectionRange(at, at);
+    }
+    changed();
+  };
+}
+
 /** Make an element of a drawing. */
 export function svg(name, fields) {
   const made = document.createElementNS("http://www.w3.org/2000/svg", name);

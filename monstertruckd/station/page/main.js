@@ -47,6 +47,7 @@ async function order(name, more = {}) {
 
 function outcome(what, answer) {
   byId("refusal").textContent = answer.ok ? "" : words("order.refused", { what: words(what), why: answer.text || reason(answer.reason) });
+  if (!answer.ok) byId("refusal").scrollIntoView({ block: "nearest" });
   return answer.ok;
 }
 
@@ -117,7 +118,7 @@ link.on("robots", ({ names }) => {
   if (wanted !== link.robot) link.watch(wanted);
 });
 link.on("facts", ({ mapping }) => (byId("map-none").hidden = mapping !== false));
-link.on("robot", () => (byId("map-none").hidden = true));
+link.on("robot", () => (byId("map-none").hidden = byId("command").hidden = true));
 link.on("hello", ({ role }) => (document.body.dataset.role = role));
 link.on("open", (open) => {
   if (!open) link.robot = null; // what was watched is asked for again

@@ -1,5 +1,5 @@
 // Missions drawn on the map: waypoints that are placed, turned, dragged and removed, then driven in their order, watched, or kept as a file.
-import { byId, element } from "./dom.js";
+import { byId, element, nameField } from "./dom.js";
 import { towards } from "./goal.js";
 import { give } from "./mapfile.js";
 import { degrees, number, words } from "./words.js";
@@ -32,6 +32,7 @@ export function stopOf({ running, node }, stops) {
 
 export class MissionTool {
   button = "tool-mission";
+  words = "mission-draw";
   hint = "mission.hint";
 
   /**
@@ -60,7 +61,7 @@ export class MissionTool {
       this.set([]);
       tools.choose(null);
     };
-    byId("mission-name").oninput = () => this.show();
+    nameField("mission-name", () => this.show());
   }
 
   enter() {
@@ -121,8 +122,9 @@ export class MissionTool {
 
   show() {
     byId("mission").hidden = this.tools.chosen !== this;
-    byId("mission-text").textContent = words("mission.stops", { count: this.stops.length });
-    const ready = this.stops.length > 0 && byId("mission-name").validity.valid;
+    const named = byId("mission-name").validity.valid;
+    const ready = this.stops.length > 0 && named;
+    byId("mission-text").textContent = named ? words(ready ? "mission.stops" : "mission.first", { count: this.stops.length }) : words("name.wrong");
     byId("mission-run").disabled = byId("mission-keep").disabled = !ready;
     const key = JSON.stringify(this.stops);
     if (byId("mission-stops").dataset.shown === key) return;

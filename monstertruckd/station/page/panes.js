@@ -5,7 +5,8 @@ import { words } from "./words.js";
 /** @returns {HTMLElement[]} */
 const tabs = () => [...document.querySelectorAll("[role=tab]")].map((tab) => /** @type {HTMLElement} */ (tab));
 
-function choose(tab) {
+/** Choose a tab, and show its pane. */
+export function showTab(tab) {
   for (const each of tabs()) {
     const chosen = each === tab;
     each.setAttribute("aria-selected", String(chosen));
@@ -18,13 +19,13 @@ function choose(tab) {
 }
 
 function watch(tab) {
-  tab.onclick = () => choose(tab);
+  tab.onclick = () => showTab(tab);
   tab.onkeydown = (event) => {
     const by = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
     if (!by) return;
     const shown = tabs().filter((each) => !each.hidden);
     const next = shown[(shown.indexOf(tab) + by + shown.length) % shown.length];
-    choose(next);
+    showTab(next);
     next.focus();
   };
 }

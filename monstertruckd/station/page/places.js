@@ -1,5 +1,5 @@
 // Points of interest: the list of the robot's, and the tool that marks, moves, names, removes and drives to them on the map.
-import { byId, element } from "./dom.js";
+import { byId, element, nameField } from "./dom.js";
 import { compose } from "./geometry.js";
 import { towards } from "./goal.js";
 import { degrees, number, words } from "./words.js";
@@ -20,6 +20,7 @@ export function freeName(stem, taken) {
 
 export class Places {
   button = "tool-point";
+  words = "point-draw";
   hint = "point.hint";
 
   /**
@@ -44,7 +45,7 @@ export class Places {
     byId("point-go").onclick = () => this.page.go(poseAt(this.edited));
     byId("point-remove").onclick = () => this.remove(this.edited.old);
     byId("point-drop").onclick = () => this.edit(null);
-    byId("point-name").oninput = () => this.showForm();
+    nameField("point-name", () => this.showForm());
     byId("point-here").onclick = () => this.ask({ do: "point", order: "mark", name: freeName("place", this.names) });
   }
 

@@ -1,11 +1,12 @@
 // The pane of live plots: any number of any topic, in panels that the user pins, with one cursor for them, the map and the camera.
 import { byId, element } from "./dom.js";
-import { Table, titleOf, unitIn } from "./series.js";
+import { Table, matching, titleOf, unitIn } from "./series.js";
 import { number, words } from "./words.js";
 
 const COLOURS = ["route", "scan", "goal", "ghost", "deformed", "frontier"];
 const HEIGHT = 150;
 const PAUSE = 250; // ms between two drawings of a panel
+const OFFERED = 12; // numbers that are listed for one word
 const MOST = 100; // numbers that the station sends one browser
 
 /**
@@ -73,13 +74,24 @@ export class Plots {
   }
 
   add(name, into) {
-    if (!(name in (this.meanings ?? {}))) return void (byId("plot-note").textContent = words("plots.unknown", { name }));
-    if (this.names.length >= MOST) return;
-    byId("plot-note").textContent = byId("plot-name").value = "";
+    const [found, ...others] = matching(this.meanings ?? {}, name);
+    this.offer(others.length ? [found, ...others] : [], into);
+    byId("plot-note").textContent = found ? (others.length ? words("plots.several", { name }) : "") : words("plots.unknown", { name });
+    if (!found || others.length || this.names.length >= MOST) return;
+    byId("plot-name").value = "";
     const panel = this.panels[into];
-    if (!panel) this.panels.push({ names: [name] });
-    else if (!panel.names.includes(name)) panel.names.push(name);
+    if (!panel) this.panels.push({ names: [found] });
+    else if (!panel.names.includes(found)) panel.names.push(found);
     this.changed();
+  }
+
+  /** Offer numbers, each with its meaning, to be plotted by a press. */
+  offer(names, into) {
+    byId("plot-found").replaceChildren(...names.slice(0, OFFERED).map((name) => {
+      const choose = element("button", { textContent: words("plots.add"), ariaLabel: words("plots.add.name", { name: titleOf(name) }) });
+      choose.onclick = () => this.add(name, into);
+      return element("li", {}, element("span", {}, titleOf(name), element("small", { textContent: this.meanings[name] })), choose);
+    }));
   }
 
   drop(panel, name) {

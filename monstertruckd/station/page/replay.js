@@ -1,5 +1,6 @@
 // The time bar of a recording that is shown in place of a robot.
 import { byId } from "./dom.js";
+import { showTab } from "./panes.js";
 import { number, words } from "./words.js";
 
 export class ReplayBar {
@@ -30,6 +31,7 @@ export class ReplayBar {
     this.recording = name.includes(" ");
     byId("replay").hidden = !this.recording;
     document.body.dataset.replay = this.recording;
+    if (this.recording) showTab(byId("tab-truck"));
   }
 
   showStops(robot) {
@@ -45,8 +47,8 @@ export class ReplayBar {
     if (!this.held) bar.value = state.at;
     bar.setAttribute("aria-valuetext", words("replay.time", { at: number(state.at, 0), length: number(state.length, 0) }));
     byId("replay-time").textContent = words("replay.time", { at: number(state.at, 1), length: number(state.length, 0) });
-    byId("replay-fault").hidden = !state.fault;
-    byId("replay-fault").textContent = words("replay.fault", { fault: state.fault ?? "" });
+    byId("replay-fault").hidden = !state.fault && !state.growing;
+    byId("replay-fault").textContent = words(state.growing ? "replay.growing" : "replay.fault", { fault: state.fault ?? "" });
     byId("replay-play").textContent = words(state.playing ? "replay.pause" : "replay.play");
   }
 }

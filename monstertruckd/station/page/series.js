@@ -102,6 +102,24 @@ export function unitIn(meaning) {
   return name.startsWith("rad") ? { name: name.replace("rad", "°"), factor: 180 / Math.PI } : { name: name === "degrees" ? "°" : name, factor: 1 };
 }
 
+/**
+ * Names that are meant by what was typed: the one of that name or title, else all whose title and meaning have every word, closest titles first.
+ *
+ * @param {Record<string, string>} meanings by name
+ * @param {string} typed
+ * @returns {string[]}
+ */
+export function matching(meanings, typed) {
+  const names = Object.keys(meanings);
+  const text = typed.toLowerCase();
+  const exact = names.find((name) => name === typed || titleOf(name) === text);
+  if (exact) return [exact];
+  const parts = text.split(/[\s/:._]+/).filter(Boolean);
+  const has = (where) => parts.every((part) => where.toLowerCase().includes(part));
+  const rank = (name) => titleOf(name).length + (has(titleOf(name)) ? 0 : 1000);
+  return parts.length ? names.filter((name) => has(`${titleOf(name)} ${meanings[name]}`)).sort((a, b) => rank(a) - rank(b)) : [];
+}
+
 /** A number's name as people read it. */
 export function titleOf(name) {
   const [topic, path] = name.split(":");

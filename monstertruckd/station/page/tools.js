@@ -7,6 +7,7 @@ import { words } from "./words.js";
  *
  * @typedef {object} Tool
  * @property {string} button id of the button that chooses it
+ * @property {string} [words] id of another button that chooses it, among the tasks
  * @property {string} hint key of the text over the map while it is chosen
  * @property {(place: number[]) => void} press
  * @property {(place: number[]) => void} drag
@@ -29,6 +30,7 @@ export class Tools {
   add(tool) {
     this.all.push(tool);
     byId(tool.button).onclick = () => this.choose(this.chosen === tool ? null : tool);
+    if (tool.words) byId(tool.words).onclick = () => this.choose(tool);
   }
 
   /** @param {Tool | null} tool null = the map is moved */
@@ -40,7 +42,10 @@ export class Tools {
     tool?.enter?.();
     for (const each of this.all) byId(each.button).setAttribute("aria-pressed", String(each === tool));
     byId("hint").hidden = tool === null;
-    if (tool) byId("hint").textContent = words(tool.hint);
+    if (tool) {
+      byId("hint").textContent = words(tool.hint);
+      byId("view").scrollIntoView({ block: "nearest" });
+    }
     this.map.setTool(tool);
   }
 }

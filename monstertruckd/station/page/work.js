@@ -237,7 +237,7 @@ export class Work {
       if (this.engineer && !open) actions.append(button(words("recordings.delete"), confirm));
     };
     const replay = async () => {
-      actions.replaceChildren(element("progress", { max: 1, value: 0, ariaLabel: words("recordings.fetching", { name }) }));
+      actions.replaceChildren(element("p", { className: "note", textContent: words("recordings.wait") }), element("progress", { max: 1, value: 0, ariaLabel: words("recordings.fetching", { name }) }));
       const answer = await this.link.ask({ do: "replay", name });
       offer();
       if (this.page.outcome("recordings.replay", answer)) this.page.watch(answer.value.robot);

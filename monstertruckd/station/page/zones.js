@@ -1,12 +1,14 @@
 // Zones: the list of the robot's, with their switches, and the form of one that was drawn on the map.
-import { byId, element } from "./dom.js";
+import { byId, element, nameField } from "./dom.js";
 import { freeName } from "./places.js";
 import { number, words } from "./words.js";
 
 const OFF_FOR = 600; // seconds
+const FEWEST = 3; // corners
 
 export class Zones {
   button = "tool-zone";
+  words = "zone-draw";
   hint = "zone.hint";
 
   /**
@@ -28,13 +30,14 @@ export class Zones {
     for (const kind of ["zones", "robot", "hello"]) link.on(kind, () => this.show());
     byId("zone-kind").append(...["stop", "leave", "speed"].map((kind) => new Option(words(`zone.kind.${kind}`), kind)));
     byId("zone-kind").onchange = () => this.showForm();
+    nameField("zone-name", () => this.showForm());
     byId("zone-add").onclick = () => this.add();
     byId("zone-drop").onclick = () => tools.choose(null);
   }
 
   enter() {
-    this.set([]);
     byId("zone-name").value = freeName("zone", this.zones.map(({ name }) => name));
+    this.set([]);
   }
 
   leave() {
@@ -82,8 +85,10 @@ export class Zones {
   showForm() {
     byId("zone").hidden = this.tools.chosen !== this;
     byId("zone-limit").parentElement.hidden = byId("zone-kind").value !== "speed";
-    byId("zone-text").textContent = words("zone.corners", { count: this.corners.length });
-    byId("zone-add").disabled = this.corners.length < 3;
+    const missing = FEWEST - this.corners.length;
+    const named = byId("zone-name").validity.valid;
+    byId("zone-text").textContent = !named ? words("name.wrong") : missing > 0 ? words("zone.missing", { count: missing }) : words("zone.corners", { count: this.corners.length });
+    byId("zone-add").disabled = missing > 0 || !named;
   }
 
   async add() {

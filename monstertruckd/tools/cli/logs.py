@@ -149,11 +149,13 @@ def fetch_command(
         return
     to = output or Path(Path(name).name)
     with progress(f"fetching {name}", 1.0) as shown:
-        size = with_robot(lambda client, _: fetch_recording(client, name, to, shown), robot, endpoint, 5.0, named=False)
+        fetched = with_robot(
+            lambda client, _: fetch_recording(client, name, to, shown), robot, endpoint, 5.0, named=False
+        )
     if json_output:
-        print_json({"name": name, "file": str(to), "bytes": size})
+        print_json({"name": name, "file": str(to), "bytes": fetched.bytes})
     else:
-        print(f"{to}  {size / 1e6:.2f} MB")
+        print(f"{to}  {fetched.bytes / 1e6:.2f} MB")
 
 
 def _show_recordings(rows: "list[dict[str, Any]]", *, json_output: bool) -> None:

@@ -144,9 +144,9 @@ def test_a_fetch_goes_on_with_the_same_recording_alone(folder: Path, tmp_path: P
                 return await call(what, **payload)
 
         part.write_bytes(whole[:200_000])
-        assert await fetch_recording(Robot(), name, part, lambda _: None) == len(whole)
+        assert (await fetch_recording(Robot(), name, part, lambda _: None)).bytes == len(whole)
         assert part.read_bytes() == whole
-        assert await fetch_recording(Robot(), name, part, lambda _: None) == len(whole)
+        assert (await fetch_recording(Robot(), name, part, lambda _: None)).bytes == len(whole)
         part.write_bytes(os.urandom(100_000))  # of another robot, whose recordings have the same names
         before = part.read_bytes()
         with pytest.raises(InputError, match=r"fetched\.mcap: is not the beginning of run-000001-000\.mcap"):
@@ -162,7 +162,7 @@ def test_what_goes_wrong_with_a_file_is_said_and_no_bug(folder: Path, monkeypatc
 
     async def scenario(call, _):
         beyond = await call("recording_read", name="run-000001-000.mcap", offset=10**24)
-        assert beyond == {"data": "", "bytes": 300_000}
+        assert beyond == {"data": "", "bytes": 300_000, "open": False}
         with monkeypatch.context() as patch:
             patch.setattr(Path, "open", gone)
             patch.setattr(Path, "unlink", gone)

@@ -251,19 +251,25 @@ async def a_zone_is_drawn_on_the_map_and_turned_off(page: Page) -> None:
     zone = {"name": "ramp", "kind": "speed", "corners": [[0, 0], [1, 0], [1, 1]], "mask": None, "limit": 0.1}
     zone |= {"inside": "stop", "saved": True, "off_until": None}
     await say(page, {"kind": "zones", "m": {"zones": [zone], "inside": ["ramp"]}})
-    await page.click("#tool-zone")
+    await page.click("#tab-tasks")
+    await page.click("#zone-draw")
     for place in ([-1, 1], [0.5, 1], [0.5, -0.5]):
         assert await page.is_disabled("#zone-add")
+        assert "corners left" in await page.inner_text("#zone-text")
         await page.mouse.click(*await page.evaluate(PLACE, place))
+    await page.fill("#zone-name", "1st")
+    assert await page.is_disabled("#zone-add")
+    await expect(page.locator("#zone-text")).to_contain_text("a letter first")
+    await page.fill("#zone-name", "My zone")
+    assert await page.input_value("#zone-name") == "my-zone"
     await drag(page, await page.evaluate(PLACE, [0.5, -0.5]), await page.evaluate(PLACE, [0.5, -0.8]))
     await page.evaluate("void (window.sent = [])")
     await page.click("#zone-add")
-    await page.click("#tab-tasks")
     await expect(page.locator("#zones")).to_contain_text("ramp, speed limit 0.10 m/s, robot inside")
     await page.click("#zones button >> nth=0")
     sent = json.loads(await page.evaluate("JSON.stringify(window.sent)"))
     add, off = (each for each in sent if each["do"] == "zone")
-    assert (add["order"], add["area"]["kind"], add["area"]["inside"]) == ("add", "keepout", "stop")
+    assert (add["name"], add["area"]["kind"], add["area"]["inside"]) == ("my-zone", "keepout", "stop")
     corners = [value for corner in add["area"]["corners"] for value in corner]
     assert corners == pytest.approx([-1, 1, 0.5, 1, 0.5, -0.8], abs=0.02), "a corner that is dragged is no new one"
     assert (off["order"], off["name"], off["seconds"]) == ("off", "ramp", 600)
@@ -338,7 +344,9 @@ async def a_mission_is_drawn_on_the_map_run_and_watched(page: Page) -> None:
     await say(page, FACTS, {"kind": "points", "m": {"points": [point]}})
     await expect(page.locator("#tool-mission"), "the robot has no planner").to_be_hidden()
     await say(page, FACTS | {"goals": True})
-    await page.click("#tool-mission")
+    await page.click("#tab-tasks")
+    await page.click("#mission-draw")
+    await expect(page.locator("#mission-text")).to_contain_text("first waypoint")
     for place in ([0, 1], [1, 0], [0, -1], [-1, -1]):
         x, y = await page.evaluate(PLACE, place)
         await page.mouse.click(x, y)
@@ -350,8 +358,9 @@ async def a_mission_is_drawn_on_the_map_run_and_watched(page: Page) -> None:
         "door×",
         "0.00, -1.00 m, -135°×",
     ]
-    await page.fill("#mission-name", "Not a name")
+    await page.fill("#mission-name", "not/a/name")
     assert await page.is_disabled("#mission-run")
+    await expect(page.locator("#mission-text")).to_contain_text("a letter first")
     await page.fill("#mission-name", "patrol")
     await page.fill("#mission-rounds", "3")
     await page.evaluate("void (window.sent = [])")
@@ -369,6 +378,7 @@ async def a_mission_is_drawn_on_the_map_run_and_watched(page: Page) -> None:
     await answer(page, order)
     await page.wait_for_selector("#mission", state="hidden")
     assert await page.evaluate(STOPS) == [1, 1, -1]
+    await page.click("#tab-drive")
     await say(page, {"kind": "robot", "name": "truck"}, FACTS)
 
 
@@ -844,6 +854,14 @@ async def values_over_time_are_kept_for_ten_minutes_and_found_by_their_time(page
     assert found["title"] == "pose pose x"
 
 
+MATCHING = """
+async ([meanings, typed]) => {
+  const { matching } = await import("/page/series.js");
+  return typed.map((each) => matching(meanings, each));
+}
+"""
+
+
 async def numbers_are_plotted_pinned_and_pointed_at(page: Page) -> None:
     async def asked() -> list[dict[str, Any]]:
         sent: list[dict[str, Any]] = await page.evaluate("window.sent.filter((each) => each.do === 'plot')")
@@ -857,13 +875,22 @@ async def numbers_are_plotted_pinned_and_pointed_at(page: Page) -> None:
     await say(page, {"kind": "answer", "id": listed["id"], "ok": True, "value": {"numbers": meanings}})
     await page.wait_for_function("() => document.querySelectorAll('#plot-names option').length === 2")
 
-    await page.fill("#plot-name", "sensor/battery")
+    await page.fill("#plot-name", "compass")
     await page.click("#plot-add")
-    await expect(page.locator("#plot-note")).to_contain_text("choose a number from the list")
-    for name, into in (("sensor/battery:voltage", ""), ("state/pose:twist.wz", "0")):
-        await page.select_option("#plot-into", into)
-        await page.fill("#plot-name", name)
-        await page.press("#plot-name", "Enter")
+    await expect(page.locator("#plot-note")).to_have_text("No number matches compass")
+    await page.fill("#plot-name", "a")
+    await page.click("#plot-add")
+    await expect(page.locator("#plot-found span")).to_contain_text(["battery voltagePack", "pose twist wzTurn"])
+    await page.get_by_role("button", name="Add battery voltage").click()
+    await expect(page.locator("#plot-found li")).to_have_count(0)
+    assert await page.evaluate(MATCHING, [meanings, ["Battery", "pose twist wz", "turn rate", "", "battery rate"]]) == [
+        ["sensor/battery:voltage"],
+        *2 * [["state/pose:twist.wz"]],
+        *2 * [[]],
+    ]
+    await page.select_option("#plot-into", "0")
+    await page.fill("#plot-name", "state/pose:twist.wz")
+    await page.press("#plot-name", "Enter")
     await page.locator(".plot canvas").wait_for()
     assert await page.locator(".plot").count() == 1
     order = (await asked())[-1]

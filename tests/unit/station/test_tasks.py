@@ -339,6 +339,15 @@ async def test_a_cut_recording_is_called_so(monkeypatch):
         assert of(await shown(viewer), "replay")[0]["fault"] == fault
 
 
+async def test_the_missing_end_of_a_recording_that_is_being_written_is_no_damage(monkeypatch):
+    monkeypatch.setattr(RecordedDrive, "fault", "has no end")
+    feed = ReplayFeed("truck run-1", Path("run-1.mcap"), RecordedDrive, WallClock(), growing=True)
+    viewer = Viewer()
+    feed.attach(viewer)
+    state = of(await shown(viewer), "replay")[0]
+    assert (state["growing"], state["fault"]) == (True, None)
+
+
 async def test_a_damaged_event_of_a_recording_is_left_out():
     def damaged():
         raise InputError("cut off")
@@ -398,6 +407,7 @@ async def test_the_emergency_stop_of_a_recording_acts_on_its_robot_although_the_
 async def test_a_recording_that_nobody_looks_at_makes_room_for_another(monkeypatch: pytest.MonkeyPatch):
     async def fetched(address, name, user, clock, file, progress):
         file.write_bytes(b"x")
+        return recordings.Fetched(1, open=False)
 
     monkeypatch.setattr(server, "fetch", fetched)
     monkeypatch.setattr(server, "MOST_REPLAYS", 2)
