@@ -25,6 +25,8 @@ export class Plots {
     /** @type {any} the library, once the pane was shown */
     this.uPlot = null;
     this.meanings = null;
+    /** @type {Promise<void> | null} */
+    this.loading = null;
     this.cursor = null;
     /** @type {Panel[]} */
     this.panels = JSON.parse(localStorage.getItem("plots") ?? "[]").map((names) => ({ names }));
@@ -61,8 +63,12 @@ export class Plots {
     if (this.link.open) this.page.outcome("tab.plots", answer);
   }
 
-  /** Load what only this pane needs, once. */
-  async begin() {
+  /** Load what only this pane needs, once, also if it is asked for again meanwhile. */
+  begin() {
+    return (this.loading ??= this.load().finally(() => (this.loading = null)));
+  }
+
+  async load() {
     if (this.meanings) return;
     const [listed, { default: uPlot }] = await Promise.all([this.link.ask({ do: "numbers" }), import("./uplot.js")]);
     if (!this.page.outcome("tab.plots", listed)) return;
@@ -73,8 +79,10 @@ export class Plots {
     this.show();
   }
 
-  add(name, into) {
-    const [found, ...others] = matching(this.meanings ?? {}, name);
+  async add(name, into) {
+    await this.begin();
+    if (!this.meanings) return;
+    const [found, ...others] = matching(this.meanings, name);
     this.offer(others.length ? [found, ...others] : [], into);
     byId("plot-note").textContent = found ? (others.length ? words("plots.several", { name }) : "") : words("plots.unknown", { name });
     if (!found || others.length || this.names.length >= MOST) return;

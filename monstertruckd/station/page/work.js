@@ -16,12 +16,15 @@ export class Work {
   constructor(link, page) {
     this.link = link;
     this.page = page;
+    /** Number of the mission whose end was told; null while one runs, undefined before the robot said; @type {number | null | undefined} */
+    this.told = undefined;
     link.on("fetching", ({ name, share }) => {
       const bar = byId("recordings").querySelector(`[data-name="${name}"] progress`);
       if (bar) bar.value = share;
     });
     for (const kind of ["facts", "robot", "explore", "mission", "behaviour", "hello"]) link.on(kind, () => this.showTasks());
     link.on("robot", () => this.clear());
+    link.on("mission", (mission) => this.tellEnd(mission));
     link.on("event", ({ reason: why }) => {
       if (why === "setting_changed" && !byId("pane-settings").hidden) this.loadSettings();
       if (why === "recording_deleted" && !byId("pane-recordings").hidden) this.loadRecordings();
@@ -48,10 +51,18 @@ export class Work {
 
   clear() {
     this.elsewhere = false;
+    this.told = undefined;
     byId("settings").replaceChildren();
     byId("recordings").replaceChildren();
     if (!byId("pane-settings").hidden) this.loadSettings();
     if (!byId("pane-recordings").hidden) this.loadRecordings();
+  }
+
+  /** Say why a mission ended before it was done, once, also to people who look at another pane. */
+  tellEnd({ running, number: mission, outcome, text }) {
+    const news = !running && this.told !== undefined && this.told !== mission;
+    this.told = running ? null : mission;
+    if (news && !["mission_done", "cancelled"].includes(outcome)) this.page.outcome("task.mission", { ok: false, text, reason: outcome });
   }
 
   async ask(what, command) {

@@ -379,6 +379,13 @@ async def a_mission_is_drawn_on_the_map_run_and_watched(page: Page) -> None:
     await page.wait_for_selector("#mission", state="hidden")
     assert await page.evaluate(STOPS) == [1, 1, -1]
     await page.click("#tab-drive")
+    ends = {"number": 1, "running": False, "outcome": "goal_blocked", "text": "step 1 of 3: in a keepout zone"}
+    await say(page, {"kind": "mission", "m": ends | {"number": 0, "outcome": "ok"}}, {"kind": "mission", "m": ends})
+    await expect(page.locator("#refusal")).to_have_text("Mission: step 1 of 3: in a keepout zone")
+    await page.evaluate("void (document.querySelector('#refusal').textContent = '')")
+    await say(page, {"kind": "mission", "m": ends}, {"kind": "mission", "m": ends | {"number": 2, "running": True}})
+    await say(page, {"kind": "mission", "m": ends | {"number": 2, "outcome": "mission_done", "text": "done"}})
+    assert await page.inner_text("#refusal") == ""
     await say(page, {"kind": "robot", "name": "truck"}, FACTS)
 
 
@@ -869,14 +876,14 @@ async def numbers_are_plotted_pinned_and_pointed_at(page: Page) -> None:
 
     await page.evaluate("void (window.sent = [])")
     await page.click("#tab-plots")
+    await page.fill("#plot-name", "compass")
+    await page.click("#plot-add")  # before the station has named any number
     await page.wait_for_function("() => window.sent.some((each) => each.do === 'numbers')")
     (listed,) = await page.evaluate("window.sent.filter((each) => each.do === 'numbers')")
     meanings = {"sensor/battery:voltage": "Pack voltage, V.", "state/pose:twist.wz": "Turn rate, rad/s."}
     await say(page, {"kind": "answer", "id": listed["id"], "ok": True, "value": {"numbers": meanings}})
     await page.wait_for_function("() => document.querySelectorAll('#plot-names option').length === 2")
 
-    await page.fill("#plot-name", "compass")
-    await page.click("#plot-add")
     await expect(page.locator("#plot-note")).to_have_text("No number matches compass")
     await page.fill("#plot-name", "a")
     await page.click("#plot-add")
