@@ -1,12 +1,14 @@
 """Waiting times of a new user: from the clone to the first lap, and for the first commands.
 
-    python benchmarks/first_hour.py [--trials 40] [--only NAME ...]
+    python -m benchmarks.first_hour [--trials 40] [--only NAME ...]
 
     lap      git clone and `bootstrap demo --config lap` in it: packages from the cache, kernels not compiled, s
     help     `--help` to its end, s
     estop    from the start of `monstertruckd estop` to the quick stop on the drive controller's wire, s
     status   from the start of `status` on a terminal of 80x24 to the first picture with the robot's mode, s
     goto     from the start of `goto`, to a daemon that has just started, to the first route, s; kernels compiled
+    tasks    on the page of `try`: add a zone, run a mission, plot the battery, start the compass's calibration,
+             download the log, replay it; waiting, and the presses and keys of the keystroke-level model, s
 
 ``estop``, ``status`` and ``goto`` connect to a daemon and an emulated truck in separate processes; the goals are for
 two idle cores. For ``estop`` and ``status``, daemon and truck have a core each; for ``goto`` the daemon and its workers
@@ -34,18 +36,22 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from estop import Stops, order, process
 
+from benchmarks.estop import Stops
+from benchmarks.estop_parts.processes import order, process
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock, run_wall
 from monstertruck_runtime.mailbox import latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.req import Order
 from monstertruckd.tools.demo.runs import connect, free_endpoint, write_overlay
+from tests.daemon.browser_kit import PATIENCE, chromium, opened
+from tests.daemon.page_tasks import TASKS, timed, tried
 
 ROOT = Path(__file__).resolve().parents[1]
 COMMAND = (sys.executable, "-m", "monstertruckd")
 GOALS = {"lap": 20.0, "help": 0.2, "estop": 0.17, "estop_p99": 0.2, "status": 1.0, "goto": 5.0}
+GOALS |= dict.fromkeys(TASKS, 60.0)
 GOAL_POSE = ("8.5", "6", "0")
 WAIT = 60.0
 """Seconds after which a part has failed."""
@@ -180,6 +186,14 @@ async def goto(clock: Clock, folder: Path) -> dict[str, float]:
     return {"goto": taken}
 
 
+async def tasks(_: Clock, folder: Path) -> dict[str, float]:
+    """Carry out the tasks of a new user on the page."""
+    async with tried(folder) as url, chromium(folder) as browser:
+        page = await opened(browser, url, viewport={"width": 1440, "height": 900})
+        await page.wait_for_selector("#map[data-drawn=true]", timeout=4 * PATIENCE)
+        return {name: await timed(page, task) for name, task in TASKS.items()}
+
+
 def served(part: Callable[..., Any], *arguments: int) -> dict[str, float]:
     """Run a part that needs a robot."""
 
@@ -200,6 +214,7 @@ def main() -> int:
         "estop": lambda trials: served(estop, trials),
         "status": lambda trials: served(status, max(trials // 4, 3)),
         "goto": lambda _: served(goto),
+        "tasks": lambda _: served(tasks),
         "lap": lambda _: lap(),
     }
     parser.add_argument("--only", nargs="*", choices=[*parts], default=[*parts])
