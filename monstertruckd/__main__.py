@@ -15,7 +15,7 @@ def main() -> None:
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: os._exit(0))
     with _early(sys.argv[1:]):
-        from monstertruckd.tools.cli.main import main as command_line  # noqa: PLC0415 - takes half a second
+        from monstertruckd.tools.cli.entry import main as command_line  # noqa: PLC0415 - takes its time
 
         command_line()
 

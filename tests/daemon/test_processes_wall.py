@@ -75,7 +75,7 @@ main()
 @pytest.mark.parametrize(
     "stage",
     [
-        "monstertruckd.tools.cli.main",
+        "monstertruckd.tools.cli.entry",
         "monstertruckd.config.load:load_config",
         "zenoh:open",
         "monstertruckd.gate.service:GateService.run",
@@ -83,7 +83,7 @@ main()
         *(
             pytest.param(stage, marks=pytest.mark.long)
             for stage in (
-                "monstertruckd.tools.cli.main:app",
+                "monstertruckd.tools.cli.entry:mounted",
                 "monstertruckd.run",
                 "monstertruckd.run:run_wall",
                 "monstertruckd.gate.latch:EstopLatch.prepare",
