@@ -58,7 +58,7 @@ def test_a_command_loads_its_own_module(arguments: list[str], module: str):
     assert not modules & {"main", "demo", "calibrate", "goto", "kinematics"}
 
 
-def test_a_wrong_command_is_told_the_nearest_of_all():
+def test_a_mistyped_command_is_answered_with_the_nearest_of_all():
     done = subprocess.run(
         [sys.executable, "-m", "monstertruckd", "zon"], capture_output=True, text=True, timeout=30, check=False
     )
