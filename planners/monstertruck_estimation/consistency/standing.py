@@ -69,27 +69,34 @@ class StandingWatch:
 
     def _judged(self) -> StandingBody | None:
         _, rolled, shown, variances = np.array(self._places).T
+        least = 3  # number of places beyond the coefficients; the stated variance has the weight of as many places
+        apart = rolled - rolled[:-2, None]  # at least two places after the break; row: break, column: place
+        sloped = np.arange(len(apart)) >= 3  # places that determine the slope before the break; with fewer it is 1
+        free = len(rolled) - np.where(sloped, 3, 2)
+        if not (free >= least).any():
+            return None
+        before, after = np.minimum(apart, 0.0), np.maximum(apart, 0.0)
+        stood = np.where(sloped[:, None], shown, shown - before)
+        slopes = np.where(sloped[:, None], before, 0.0)
+        stands = _residuals(slopes, stood)
+        rolls = _residuals(slopes, stood - (1.0 - self._slip) * after)
+        likelier = (rolls - stands) * (least + free) / (least * variances.mean() + stands)
+        start = int(np.where(free >= least, likelier, -np.inf).argmax())
         # Twice the logarithm of the likelihood ratio of a finding: 4 standard deviations. A false finding moves the
         # robot 3 cm back while an operator watches it.
-        likeliest, found = 4.0**2, None
-        least = 3  # number of places beyond the coefficients; the stated variance has the weight of as many places
-        for start in range(len(rolled) - 2):  # at least two places after the break
-            before, after = np.minimum(rolled - rolled[start], 0.0), np.maximum(rolled - rolled[start], 0.0)
-            columns, places = np.ones((len(rolled), 1)), shown - before
-            if start >= 3:  # places that determine the slope before the break; with fewer it is 1
-                columns, places = np.column_stack((columns, before)), shown
-            free = len(rolled) - columns.shape[1] - 1
-            if free < least:
-                continue
-            sides = np.column_stack((places, places - (1.0 - self._slip) * after))
-            coefficients = np.linalg.lstsq(columns, sides, rcond=None)[0]
-            stands, rolls = ((sides - columns @ coefficients) ** 2).sum(axis=0).tolist()
-            likelier = (rolls - stands) * (least + free) / (least * float(variances.mean()) + stands)
-            if likelier > likeliest:
-                likeliest = likelier
-                way, seen = float(rolled[-1] - rolled[start]), float(shown[-1] - shown[start])
-                found = StandingBody(since=self._places[start][0], stamp=self._places[-1][0], rolled=way, shown=seen)
-        return found
+        if likelier[start] <= 4.0**2:
+            return None
+        way, seen = float(rolled[-1] - rolled[start]), float(shown[-1] - shown[start])
+        return StandingBody(since=self._places[start][0], stamp=self._places[-1][0], rolled=way, shown=seen)
+
+
+def _residuals(along: Array, values: Array) -> Array:
+    """Return the sum of squared residuals of the line fitted to each row of ``values`` over the row of ``along``."""
+    x, y = along - along.mean(axis=1, keepdims=True), values - values.mean(axis=1, keepdims=True)
+    square = (x * x).sum(axis=1)
+    slope = np.divide((x * y).sum(axis=1), square, out=np.zeros(len(x)), where=square > 0.0)
+    residuals: Array = ((y - slope[:, None] * x) ** 2).sum(axis=1)
+    return residuals
 
 
 def spread(fit: Fit, scan: Scan, cloud: Cloud) -> float:
