@@ -536,13 +536,11 @@ class PathTracker(ABC, Generic[C]):
         nearest = run.project(pose[0], pose[1], s, s + self.config.reach)
         target, steering = reference.state(nearest.s), reference.steering(nearest.s)
         dx, dy = pose[0] - nearest.point[0], pose[1] - nearest.point[1]
-        asked, wheels = self.axles.requested, errors.wheels(self.axles.requested, grip)
-        requested = as_steered(steering, wheels)
-        slip = self._slip_besides(steering, wheels) - self._slip_besides(steering, asked)
+        wheels = errors.wheels(self.axles.requested, grip)
         return TrackingState(
             pose=pose,
             angles=as_steered(steering, errors.wheels(angles, grip)),
-            requested=requested,
+            requested=as_steered(steering, wheels),
             speed=speed or run.direction * self.config.min_speed,
             target_speed=target_speed(self.config, truck, run, profile, s, self.response.dead_time),
             acceleration=self.config.acceleration,
@@ -552,7 +550,7 @@ class PathTracker(ABC, Generic[C]):
             steering=steering,
             lateral_error=math.cos(target.heading) * dy - math.sin(target.heading) * dx,
             target=target,
-            heading_error=wrap_angle(pose[2] - target.yaw + slip),
+            heading_error=wrap_angle(pose[2] - target.yaw + self._slip_besides(steering, wheels)),
         )
 
     def _slip_besides(self, steering: Steering, angles: Angles) -> float:
