@@ -6,22 +6,24 @@ number, if USB provides one) or is on another port.
 """
 
 import itertools
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
+from pydantic import Field
 
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import disk_reason
+from monstertruck_runtime.errors import InputError, disk_reason
 from monstertruck_runtime.mailbox import latest
+from monstertruck_runtime.outside import contents_if_present, reading
 from monstertruck_runtime.ports import EventSink, Ready
 from monstertruck_runtime.small_files import make_folder, put_aside, replace_file
 from monstertruck_runtime.threads import Offload
+from monstertruck_schemas.base import Schema
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import CalibrationHealth, CalibrationState
 from monstertruck_schemas.plan import TrackerState
@@ -129,6 +131,12 @@ def _later(date: str, days: int) -> str:
     return f"{np.datetime64(date.rstrip('Z'), 's') + np.timedelta64(days, 'D')}Z" if date else ""
 
 
+class _Distance(Schema):
+    """Content of the file of the distance travelled."""
+
+    metres: Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+
+
 @dataclass
 class DistanceCounter:
     """Total distance travelled (m), kept across restarts.
@@ -147,18 +155,18 @@ class DistanceCounter:
         Returns:
             Fault of the file; empty if it is intact or missing.
         """
-        self.metres, wrong = 0.0, ""
+        self.metres = self.written = 0.0
+        if self.file is None:
+            return ""
+        expected = "the distance driven"
         try:
-            metres = float(json.loads(self.file.read_text(encoding="utf-8"))["metres"]) if self.file else 0.0
-            self.metres, wrong = (metres, "") if 0.0 <= metres < np.inf else (0.0, "is damaged")
-        except FileNotFoundError:
-            pass
-        except OSError as error:
-            wrong = f"cannot be read: {error.strerror}"
-        except (ValueError, LookupError, TypeError, OverflowError, RecursionError):
-            wrong = "is damaged"
-        self.written = self.metres
-        return wrong and f"{self.file}: {wrong}"
+            data = contents_if_present(self.file, expected, 1000)  # maximum size of the file, bytes
+            if data is not None:
+                with reading(self.file, expected):
+                    self.metres = self.written = _Distance.model_validate_json(data).metres
+        except InputError as error:
+            return str(error)
+        return ""
 
     def save(self) -> None:
         """Write the file atomically.
@@ -169,7 +177,7 @@ class DistanceCounter:
         if self.file is None:
             return
         make_folder(self.file.parent)
-        replace_file(self.file, json.dumps({"metres": round(self.metres, 1)}))
+        replace_file(self.file, _Distance(metres=round(self.metres, 1)).model_dump_json())
         self.written = self.metres
 
 

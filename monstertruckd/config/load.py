@@ -200,7 +200,7 @@ class SavedSettings:
         """
         origins = dict[Key, Origin]()
         try:
-            self.path.stat()
+            self.path.lstat()
         except FileNotFoundError:
             return {}
         except OSError:

@@ -12,7 +12,9 @@ from pathlib import Path
 from ruamel.yaml.nodes import Node, ScalarNode, SequenceNode
 
 from monstertruck_runtime.errors import ConfigError, InputError
+from monstertruck_runtime.outside import contents_if_present
 from monstertruck_runtime.small_files import replace_file
+from monstertruck_runtime.yaml_files import LARGEST_YAML
 from monstertruckd.config.load import FILE_VERSION, STEPS, Step, YamlText, included, run_steps
 
 
@@ -97,7 +99,8 @@ def carry_out(upgrades: Sequence[Upgrade]) -> None:
     """
     for upgrade in upgrades:
         try:
-            if upgrade.kept.exists() and upgrade.kept.read_bytes() != upgrade.before.encode():
+            kept = contents_if_present(upgrade.kept, "a previous configuration", LARGEST_YAML)
+            if kept is not None and kept != upgrade.before.encode():
                 raise InputError(f"{upgrade.kept}: already contains another version {upgrade.version}; move it away")
             replace_file(upgrade.kept, upgrade.before)
             replace_file(upgrade.path, upgrade.after)

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from pydantic import ValidationError
 
 from monstertruck_kinematics.chassis import Chassis
-from monstertruck_runtime.outside import cause_of
-from monstertruck_runtime.small_files import make_folder, put_aside, replace_file, require_file
+from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.outside import contents_if_present, reading
+from monstertruck_runtime.small_files import make_folder, put_aside, replace_file
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.plan import AxleDeviation, TrackerState
 from monstertruckd.config.calibration import Estimate, Result, value_at
@@ -67,13 +67,15 @@ class SteeringProposal:
         """
         if self.file is None:
             return ""
+        expected = "a proposed calibration"
         try:
-            require_file(self.file, 100_000)  # maximum size of a proposal, bytes
-            found = _File.model_validate_json(self.file.read_bytes())
-        except FileNotFoundError:
-            return ""
-        except (OSError, ValidationError, ValueError, RecursionError) as error:
-            return f"{self.file}: {error.strerror if isinstance(error, OSError) else cause_of(error)}"
+            data = contents_if_present(self.file, expected, 100_000)  # maximum size of a proposal, bytes
+            if data is None:
+                return ""
+            with reading(self.file, expected):
+                found = _File.model_validate_json(data)
+        except InputError as error:
+            return str(error)
         if found.base == self.base:
             self.result = found.result
         return ""

@@ -120,7 +120,7 @@ class EstopLatch:
         self._path = path
         self._storing = threading.Lock()
         self._mark: Mark | None = None
-        name = hashlib.blake2s(os.fsencode(path.resolve()), digest_size=8).hexdigest()
+        name = hashlib.blake2s(os.fsencode(os.path.realpath(path)), digest_size=8).hexdigest()
         self._mark_path = marks / f"monstertruckd-estop-{name}"
 
     def prepare(self) -> None:

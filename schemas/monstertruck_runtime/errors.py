@@ -43,6 +43,8 @@ class InputError(TruckError):
 class DamagedFileError(InputError):
     """A service's file is damaged; a retry is useless."""
 
+    reason = Reason.FILE_DAMAGED
+
 
 class NotFoundError(TruckError):
     """A named file, key or robot does not exist."""

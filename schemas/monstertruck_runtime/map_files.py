@@ -7,6 +7,7 @@ Unlike in the image, row 0 of the array is the lowest y, so cell (row, column) c
 import hashlib
 import io
 import math
+import os
 import re
 import sys
 from collections.abc import Mapping
@@ -192,7 +193,7 @@ def save_map(world: WorldMap, path: Path) -> None:
     """
     _, picture = map_content(world, "")
     image = path.with_suffix(".png")
-    if image.exists() and image.read_bytes() != picture:
+    if os.path.lexists(image) and not (image.is_file() and image.read_bytes() == picture):
         image = path.with_name(f"{path.stem}-{hashlib.sha256(picture).hexdigest()[:8]}.png")
     before = _picture_of(path)
     replace_file(image, picture)

@@ -26,7 +26,7 @@ from pydantic import Field
 
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.outside import contents, reading
-from monstertruck_runtime.small_files import SCRATCH, make_folder, sync_folder
+from monstertruck_runtime.small_files import SCRATCH, make_folder, require_file, sync_folder
 from monstertruck_schemas.base import Schema
 
 YAML: Final = "map.yaml"
@@ -241,12 +241,15 @@ def _check(save: Path) -> _Manifest:
     """
     manifest = _manifest(save)
     for name, part in manifest.parts.items():
-        with reading(save / name, "a file of this save"), (save / name).open("rb") as file:
-            size = os.fstat(file.fileno()).st_size
-            if size != part.size:
-                raise InputError(f"{save / name}: {size} bytes, expected {part.size} as in {MANIFEST}")
-            if hashlib.file_digest(file, "sha256").hexdigest() != part.sha256:
-                raise InputError(f"{save / name}: its checksum differs from {MANIFEST}: damaged, or from another save")
+        with reading(save / name, "a file of this save"):
+            require_file(save / name)
+            with (save / name).open("rb") as file:
+                size = os.fstat(file.fileno()).st_size
+                digest = hashlib.file_digest(file, "sha256").hexdigest() if size == part.size else ""
+        if size != part.size:
+            raise InputError(f"{save / name}: {size} bytes, expected {part.size} as in {MANIFEST}")
+        if digest != part.sha256:
+            raise InputError(f"{save / name}: its checksum differs from {MANIFEST}: damaged, or from another save")
     return manifest
 
 

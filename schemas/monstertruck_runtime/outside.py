@@ -84,6 +84,23 @@ def contents(file: Path, expected: str, most: int, refusal: type[TruckError] = I
             return stream.read(most)
 
 
+def contents_if_present(file: Path, expected: str, most: int, refusal: type[TruckError] = InputError) -> bytes | None:
+    """Read a whole file of at most ``most`` bytes; return None only if its folder has no such name.
+
+    A link whose target is missing counts as damaged: its content exists elsewhere, for example on a disk that is not
+    mounted.
+
+    Raises:
+        TruckError: ``refusal``: as for ``contents``.
+    """
+    with reading(file, expected, refusal):
+        try:
+            file.lstat()
+        except FileNotFoundError:
+            return None
+    return contents(file, expected, most, refusal)
+
+
 def text_of(file: Path, expected: str, most: int, refusal: type[TruckError] = InputError) -> str:
     """Read a whole text file of at most ``most`` bytes: UTF-8, with or without a byte order mark.
 

@@ -84,7 +84,7 @@ def replace_file(path: Path, content: str | bytes, mode: int = 0o644, *, follow_
         OSError: it could not be written, or is a folder, a device or the like; the file has either the old or the new
             content.
     """
-    place = path.resolve() if follow_links else path
+    place = Path(os.path.realpath(path)) if follow_links else path
     before = place.lstat().st_mode if os.path.lexists(place) else None
     if before is not None and not stat.S_ISREG(before):
         if follow_links or not stat.S_ISLNK(before):
@@ -213,8 +213,8 @@ def whole_file(path: Path) -> Iterator[Path]:
     Raises:
         OSError: ``path`` is a folder, a device or the like, or cannot be replaced.
     """
-    place = path.resolve()
-    if place.exists():
+    place = Path(os.path.realpath(path))
+    if os.path.lexists(place):
         require_file(place)
     part = place.with_name(place.name + ".part")
     try:

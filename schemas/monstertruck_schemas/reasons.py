@@ -40,7 +40,7 @@ class Reason(StrEnum):
     NOT_PERMITTED = "not_permitted", 12, "the user lacks the permission"
     NOT_INSTALLED = "not_installed", 13, "a program or package is missing or damaged"
     COMMAND_FAILED = "command_failed", 14, "a program of the computer failed"
-    FILE_DAMAGED = "file_damaged", 19, "a file written by the robot is damaged and ignored"
+    FILE_DAMAGED = "file_damaged", 19, "a file of the robot is damaged and not used"
     REPLAY_DIFFERS = "replay_differs", 15, "outputs recomputed from the log differ from the recorded ones"
     ACKNOWLEDGED = "acknowledged", 0, "an operator has seen a warning"
     RECORDING_DELETED = "recording_deleted", 0, "a recording was deleted"

@@ -18,6 +18,7 @@ from tests.unit.config.test_corrupt_calibration import saved
 pytestmark = [pytest.mark.wall, pytest.mark.timeout(120)]
 
 STATE = ("settings-truck.yaml", "odometer.json", "mission.json")
+ZONES = "zones.json"
 DAMAGED = {"gate": "settings-truck.yaml", "calibration": "odometer.json", "missions": "mission.json"}
 
 
@@ -42,9 +43,10 @@ async def test_a_daemon_with_damaged_files_starts_stopped_and_says_so(tmp_path: 
         calibration.write_bytes(bytes(500))
         for name in STATE:
             (state / name).write_bytes(bytes(40))
+        (state / ZONES).write_bytes(bytes(40))
         await truck.start_daemon()
         async with truck.client() as client:
-            rows = await named(client, *DAMAGED, "recorder")
+            rows = await named(client, *DAMAGED, "recorder", "zones")
             with client.subscribe(topics.GATE, latest()) as gate:
                 async with asyncio.timeout(10):
                     while gate.latest is None:
@@ -55,6 +57,10 @@ async def test_a_daemon_with_damaged_files_starts_stopped_and_says_so(tmp_path: 
             assert rows[name].reason is Reason.FILE_DAMAGED
             assert file in rows[name].detail
             assert (state / f"{file}.damaged").read_bytes() == bytes(40)
+        assert rows["zones"].reason is Reason.FILE_DAMAGED
+        assert ZONES in rows["zones"].detail
+        assert "at rest" in rows["zones"].detail
+        assert (state / ZONES).read_bytes() == bytes(40)  # a next start must not forget the stairs
         assert calibration.with_name(calibration.name + ".damaged").read_bytes() == bytes(500)
         assert rows["recorder"].reason is Reason.LOG_DAMAGED
         assert (logs / f"{zeros.name}.damaged").read_bytes() == bytes(4096)
@@ -63,4 +69,4 @@ async def test_a_daemon_with_damaged_files_starts_stopped_and_says_so(tmp_path: 
         said = {(event.source, event.reason) for event in events}
         assert {(name, Reason.FILE_DAMAGED) for name in DAMAGED} | {("recorder", Reason.LOG_DAMAGED)} <= said
         texts = " ".join(event.text for event in events)
-        assert all(name in texts for name in (*STATE, calibration.name, zeros.name))
+        assert all(name in texts for name in (*STATE, ZONES, calibration.name, zeros.name))

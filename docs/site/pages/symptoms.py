@@ -174,7 +174,7 @@ SYMPTOMS: Final = (
             "disk_full": "Copy the logs to another computer and delete them (`monstertruckd log list`).",
             "recording_failed": "The card may be worn out: replace it.",
             "log_damaged": "`monstertruckd log recover`.",
-            "file_damaged": "The file was set aside; the event names what replaces it. Check it, then reset the stop.",
+            "file_damaged": "The event names what replaces the file. Check it, then reset the stop.",
             "link_weak": "Move closer to the access point, or use a better antenna.",
             "link_down": "Check the access point and the cable; `ip -brief link`.",
             "link_open": "The network is open: use WPA2 and certificates.",

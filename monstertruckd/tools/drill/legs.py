@@ -15,7 +15,7 @@ from typing import Any, Final, Generic, TypeVar
 from pydantic import TypeAdapter
 
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.outside import contents, reading
+from monstertruck_runtime.outside import contents_if_present, reading
 from monstertruck_runtime.small_files import MEGABYTE
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
@@ -74,7 +74,7 @@ class LegFile(Generic[Outcome]):
         self._end = 0
         """Size of the complete lines (bytes): an interrupted program leaves an incomplete one."""
         most_bytes = 100 * MEGABYTE  # maximum size of a file of outcomes: a campaign of a million trials
-        data = contents(path, "outcomes of a drill", most_bytes) if path.exists() else b""
+        data = contents_if_present(path, "outcomes of a drill", most_bytes) or b""
         try:
             path.open("ab").close()  # the file must be writable before the first leg, not only after it
         except OSError as error:

@@ -24,7 +24,8 @@ from typing import Any, Final, Literal, Self, TypeVar
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from monstertruck_runtime.errors import InputError, NotFoundError
-from monstertruck_runtime.small_files import make_folder, remove_file, remove_leftovers, replace_file
+from monstertruck_runtime.outside import contents, contents_if_present
+from monstertruck_runtime.small_files import MEGABYTE, make_folder, remove_file, remove_leftovers, replace_file
 from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 from monstertruck_schemas.base import Name, Schema, first_mistake
 from monstertruck_schemas.req import Role
@@ -105,6 +106,10 @@ class CertificateRegister(Schema):
     def of_role(self, *roles: AccessRole) -> tuple[str, ...]:
         """Return the names of stations with one of these roles."""
         return tuple(name for name, station in self.stations.items() if station.role in roles)
+
+
+CERTIFICATE: Final = "a certificate"
+"""Expected content of a file in error messages."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -339,21 +344,20 @@ class Folder:
         changed = False
         for name, content in files.items():
             file = self.robot / name
-            changed |= not file.exists() or file.read_bytes() != content
+            changed |= contents_if_present(file, "a part of the robot's access", MEGABYTE) != content
             replace_file(file, content)
         return changed
 
     def _issuers(self, names: tuple[str, ...]) -> list[bytes]:
-        return [self._files(f"issuers/{name}")[0].read_bytes() for name in names]
+        return [contents(self._files(f"issuers/{name}")[0], CERTIFICATE, MEGABYTE) for name in names]
 
     def _router(self) -> bytes:
         """Return the certificate of the router's authority; empty without one."""
-        file = self.path / ROUTER_FILE
-        return file.read_bytes() if file.exists() else b""
+        return contents_if_present(self.path / ROUTER_FILE, CERTIFICATE, MEGABYTE) or b""
 
     def _trusted(self) -> bytes:
         """Return the authorities trusted by a station: the robot's and the router's."""
-        return (self.path / "authority.pem").read_bytes() + self._router()
+        return contents(self.path / "authority.pem", CERTIFICATE, MEGABYTE) + self._router()
 
     def _files(self, name: str) -> tuple[Path, Path]:
         return self.path / f"{name}.pem", self.path / f"{name}.key"

@@ -9,7 +9,7 @@ from pydantic import TypeAdapter
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_folders import opened, write_save
-from monstertruck_runtime.outside import contents, reading
+from monstertruck_runtime.outside import contents_if_present, reading
 from monstertruck_runtime.small_files import require_file
 from monstertruck_schemas.plan import MAX_COORDINATE
 from monstertruck_schemas.points import PointOfInterest
@@ -49,15 +49,16 @@ def load(folder: Path) -> list[tuple[PointOfInterest, bytes]]:
     """
     with opened(folder) as found:
         file = found.file(FILE)
-        if not file.is_file():
-            return []
         return [(point, _picture(file.with_name(picture_name(point.name)))) for point in _read(file)]
 
 
 def _read(file: Path) -> list[PointOfInterest]:
     expected = "points of interest"
+    data = contents_if_present(file, expected, LARGEST_POINTS_FILE)
+    if data is None:
+        return []
     with reading(file, expected):
-        points = _POINTS.validate_json(contents(file, expected, LARGEST_POINTS_FILE))
+        points = _POINTS.validate_json(data)
     names = [point.name for point in points]
     for point in points:
         if names.count(point.name) > 1:

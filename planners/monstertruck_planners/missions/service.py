@@ -34,7 +34,7 @@ from monstertruck_planners.missions.progress import (
 from monstertruck_planners.tasks import R, TaskServer
 from monstertruck_runtime.clock import SECOND, Clock, Schedule, minute_of_day
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError, TruckError, disk_reason
-from monstertruck_runtime.outside import contents, reading
+from monstertruck_runtime.outside import contents_if_present, reading
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
 from monstertruck_runtime.requests import does_not_drive, inner_request
 from monstertruck_runtime.small_files import put_aside, remove_file, replace_file
@@ -708,11 +708,12 @@ class MissionService:
         """
         file = self._file
         expected = "the progress of a mission"
+        # 1_000_000: maximum size of the saved progress (bytes)
+        data = None if file is None else contents_if_present(file, expected, 1_000_000)
+        if data is None:
+            return None
         with reading(str(file), expected):
-            if file is None or not file.exists():
-                return None
-            # 1_000_000: maximum size of the saved progress (bytes)
-            return SavedProgress.model_validate_json(contents(file, expected, 1_000_000))
+            return SavedProgress.model_validate_json(data)
 
     async def _say_damaged(self, why: str) -> None:
         if (file := self._file) is not None:

@@ -16,7 +16,7 @@ from monstertruck_planners.zones.config import (
 )
 from monstertruck_planners.zones.shapes import mask_of
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.outside import contents, reading
+from monstertruck_runtime.outside import contents_if_present, reading
 from monstertruck_runtime.small_files import replace_file
 from monstertruck_runtime.yaml_files import read_yaml
 from monstertruck_schemas.base import Name, Schema
@@ -121,10 +121,11 @@ def load_saved(file: Path) -> dict[str, ZoneArea]:
     Raises:
         InputError: the file is damaged.
     """
-    if not file.exists():
+    data = contents_if_present(file, _EXPECTED, LARGEST_ZONE_FILE)
+    if data is None:
         return {}
     with reading(file, _EXPECTED):
-        return ZoneFile.model_validate_json(contents(file, _EXPECTED, LARGEST_ZONE_FILE)).zones
+        return ZoneFile.model_validate_json(data).zones
 
 
 def save(file: Path, areas: dict[str, ZoneArea]) -> None:

@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.zones import files
@@ -21,6 +21,9 @@ from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.state import GateState, Odometry
 from monstertruck_schemas.topics import POSE
 from monstertruck_schemas.zones import Zone, ZoneArea, ZoneOrder, ZoneRequest, Zones
+
+UNKNOWN_ZONES: Final = "the robot stays at rest: repair the file or move it away, then restart the daemon"
+"""What follows from a file of zones that cannot be used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +90,10 @@ class ZoneService:
                 file = self._file
                 self._areas = await self._offload(lambda: files.load_saved(file))
         except InputError as error:
-            raise DamagedFileError(str(error)) from error
+            # The file keeps its name: without it, the next start would drive through its keepout zones.
+            text = f"{error}; {UNKNOWN_ZONES}"
+            self._events(Reason.FILE_DAMAGED, Severity.WARNING, self.name, text)
+            raise DamagedFileError(text) from error
         for remark in remarks:
             self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, remark)
         made = (files.zone_of(name, area, saved=True) for name, area in self._areas.items())

@@ -103,7 +103,7 @@ def test_a_damaged_odometer_begins_at_nothing_and_says_so(text, tmp_path):
     odometer = DistanceCounter(file)
     assert odometer.load() == ""  # a new robot
     file.write_text(text)
-    assert odometer.load() == f"{file}: is damaged"
+    assert odometer.load().startswith(f"{file}: ")
     assert odometer.metres == 0.0
     replace(odometer, metres=12.34).save()
     odometer.load()
@@ -131,7 +131,7 @@ def test_a_damaged_odometer_is_kept_and_an_event(tmp_path):
     run_virtual(main)
     ((reason, source, text),) = events
     assert (reason, source) == (Reason.FILE_DAMAGED, "calibration")
-    assert text.startswith(f"{file}: is damaged")
+    assert text.startswith(f"{file}: expected the distance driven")
     assert text.endswith("the file is kept as odometer.json.damaged")
     assert (tmp_path / "odometer.json.damaged").read_text() == "{"
 

@@ -94,7 +94,7 @@ def test_a_session_that_settled_starts_the_delays_anew():
 
 
 @pytest.mark.parametrize(
-    ("error", "reason"), [(DeviceMismatchError, Reason.DEVICE_MISMATCH), (DamagedFileError, Reason.BAD_INPUT)]
+    ("error", "reason"), [(DeviceMismatchError, Reason.DEVICE_MISMATCH), (DamagedFileError, Reason.FILE_DAMAGED)]
 )
 def test_a_mismatch_and_a_damaged_file_are_never_retried(error: type[TruckError], reason: Reason):
     def refuse(_: Ready) -> None:

@@ -180,5 +180,18 @@ def test_a_damaged_file_ends_the_service_with_its_name(tmp_path):
     async def never(stage):
         pytest.fail("it serves")
 
+    with pytest.raises(DamagedFileError, match=r"zones\.json.*at rest"):
+        play(never, file)
+    assert file.read_text() == "["
+
+
+def test_a_link_to_an_absent_disk_is_not_an_empty_list_of_zones(tmp_path):
+    """A robot that takes it for one would drive down the stairs that the zones guard."""
+    file = tmp_path / "zones.json"
+    file.symlink_to(tmp_path / "not mounted" / "zones.json")
+
+    async def never(stage):
+        pytest.fail("it serves")
+
     with pytest.raises(DamagedFileError, match=r"zones\.json"):
         play(never, file)
