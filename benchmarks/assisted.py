@@ -11,14 +11,11 @@ in which the true footprint touched something. The last line is JSON.
 
 import argparse
 import json
-import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
+from benchmarks import ROOT
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
@@ -28,7 +25,7 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_ove
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
-CONFIG = Path(__file__).resolve().parents[1] / "configs" / "demo.yaml"
+CONFIG = ROOT / "configs" / "demo.yaml"
 WORLDS = ("loop", "rooms", "corridor_maze")
 PERIOD = 0.1
 """Period of the stick's requests, s."""

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import ROOT
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND, VirtualClock, WallClock, run_virtual
 from monstertruck_schemas.topics import BY_NAME, TOPICS
@@ -29,7 +30,7 @@ from monstertruckd.recorder.config import BlackBoxConfig
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
-FULL = Path(__file__).resolve().parents[1] / "configs" / "full.yaml"
+FULL = ROOT / "configs" / "full.yaml"
 SAMPLE = 4.0
 GOALS = {"memory_mb": 25.2, "record_us": 15.0, "burst_p99_ms": 2.0, "loop_wait_p99_ms": 2.0}
 

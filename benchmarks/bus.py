@@ -36,9 +36,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bus_peers import scan
-from same_python import SYSTEM_PYTHON, can_import, go_on_in_the_systems_python
 
+from benchmarks.bus_peers import scan
+from benchmarks.same_python import SYSTEM_PYTHON, can_import, go_on_in_the_systems_python
 from monstertruck_runtime import wire
 from monstertruck_schemas.topics import SCAN
 

@@ -36,10 +36,11 @@ from time import process_time
 from typing import Any
 
 import numpy as np
-from calibration_parts.alone import alone
-from calibration_parts.interruptions import interruptions
-from calibration_parts.square import square
 
+from benchmarks import ROOT
+from benchmarks.calibration_parts.alone import alone
+from benchmarks.calibration_parts.interruptions import interruptions
+from benchmarks.calibration_parts.square import square
 from monstertruck_runtime.errors import TruckError
 from monstertruckd.config.calibration import CalibrationStore, with_values
 from monstertruckd.config.load import load_config
@@ -52,7 +53,6 @@ from tests.calibration_kit import Verdict, curvature_errors, hidden, run_session
 from tests.calibration_light import HALF_WIDTHS, LIGHT, coverage
 from tests.calibration_wrong import WRONG, noticed
 
-ROOT = Path(__file__).resolve().parents[1]
 OUTPUT = ROOT / "runs" / "benchmarks" / "calibration.json"
 GOAL = 0.9
 CURVATURE = 0.02

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks import ROOT
 from monstertruck_drivers.webcam.driver import complete
 from monstertruck_drivers.webcam.emulator import jpeg
 from monstertruck_drivers.webcam.packets import CameraPacket, PacketKind, PacketParser
@@ -33,7 +34,7 @@ from monstertruck_sim.world.config import CameraConfig
 from monstertruckd.tools.demo.runs import connect, free_endpoint, write_overlay
 from monstertruckd.tools.simulation.program import program
 
-FULL = Path(__file__).resolve().parents[1] / "configs" / "full.yaml"
+FULL = ROOT / "configs" / "full.yaml"
 GOAL = 0.5
 SLOWEST = 14.0
 """Pictures a second below which the camera was not really running."""

@@ -20,6 +20,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from benchmarks import ROOT
 from benchmarks.estop_parts.processes import process, processor_seconds
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock, run_wall
@@ -28,7 +29,6 @@ from monstertruck_runtime.mailbox import latest
 from monstertruck_schemas import topics
 from monstertruckd.tools.demo.runs import connect, free_endpoint, write_overlay
 
-ROOT = Path(__file__).resolve().parents[1]
 OUTPUT = ROOT / "runs" / "benchmarks" / "clients.json"
 BEAT = 2.0
 STAYS = (30.0, 120.0)

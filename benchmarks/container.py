@@ -20,10 +20,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-
-from benchmarks.service_parts.machine import PASSED_ON  # noqa: E402
+from benchmarks import ROOT
+from benchmarks.service_parts.machine import PASSED_ON
 
 FILE = ROOT / "systemd" / "container" / "Dockerfile"
 CERTIFICATES = Path("/etc/ssl/certs/ca-certificates.crt")

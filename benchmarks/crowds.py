@@ -13,17 +13,14 @@ last line is JSON.
 import argparse
 import json
 import math
-import sys
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.ndimage import label
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
+from benchmarks import ROOT
 from benchmarks.virtual_runs import goal_end
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import DistanceField
@@ -39,7 +36,7 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_ove
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
-CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+CONFIGS = ROOT / "configs"
 WORLDS = ("rooms", "hall", "workshop", "yard")
 PEOPLE = 6
 ROOM = 0.45

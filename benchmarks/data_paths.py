@@ -32,6 +32,7 @@ import numpy as np
 from pydantic import BaseModel
 
 import monstertruck_estimation.slam.service as slam_service
+from benchmarks import ROOT
 from monstertruck_runtime.actors.actor import LoopActor
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import latest
@@ -43,7 +44,6 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
-ROOT: Final = Path(__file__).resolve().parents[1]
 SOURCES: Final = ("monstertruckd", "drivers", "planners", "schemas")
 EMULATED: Final = ("monstertruck_sim/", "runtime/clock.py", "emulator.py", "firmware.py", "cable.py")
 GOALS: Final = {"scan_to_motor": 22, "scan_through_slam": 32, "goal_to_tracker": 16, "configuration_value": 5}

@@ -20,10 +20,11 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import ROOT
 from monstertruck_runtime.clock import SECOND
 from monstertruckd.tools.drill.observer import STANDING_SPEED
 from monstertruckd.tools.simulation.config import DEADMAN_LINE
-from tests.daemon.wall_kit import ROOT, Robot, end, robot
+from tests.daemon.wall_kit import Robot, end, robot
 
 FROZEN = 1.5
 """Seconds for which a daemon is stopped where nothing else stops the truck."""

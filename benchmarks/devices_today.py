@@ -14,10 +14,7 @@ import importlib
 import json
 import pkgutil
 import sys
-from pathlib import Path
 from typing import Any
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks import devices_today_parts
 

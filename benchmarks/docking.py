@@ -13,7 +13,6 @@ docked pose, and the true footprint touched nothing. The last line is JSON.
 import argparse
 import json
 import math
-import sys
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -21,8 +20,7 @@ from typing import Any
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
+from benchmarks import ROOT
 from benchmarks.virtual_runs import behaviour_run
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import compose
@@ -34,7 +32,7 @@ from monstertruck_sim.world.built_in import BUILT_IN
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 
-CONFIG = Path(__file__).resolve().parents[1] / "configs" / "dock.yaml"
+CONFIG = ROOT / "configs" / "dock.yaml"
 WORLDS = ("rooms", "workshop", "hall")
 DIRECTIONS = ("forward", "reverse")
 LENGTH, WIDTH = 0.47, 0.34

@@ -19,8 +19,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from exploration_parts.arena import Arena
 
+from benchmarks import ROOT
+from benchmarks.exploration_parts.arena import Arena
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.map_files import FREE
 from monstertruck_sim.world.built_in import BUILT_IN
@@ -33,7 +34,6 @@ from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 from tests.calibration_kit import START_UP, LocalTruck
 from tests.unit.tools.doctor.catalogue import FAULTS, Fault, drawn, examined, log, mistakes, weaving
 
-ROOT = Path(__file__).resolve().parents[1]
 WORLDS = "yard", "hall", "loop", "rooms", "corridor_maze"
 SERVOS = {"front_servo": (1, 1461.0, -9.9), "rear_servo": (0, 1422.0, -10.9)}
 """Channel, centre (us) and scale (us/deg) of those that the shipped configuration believes in."""

@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import ROOT
 from monstertruck_sim.faults import FaultKind
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.drill.campaign import Campaign, CampaignReport
@@ -32,7 +33,6 @@ from monstertruckd.tools.drill.random_drill import Drill, DrillReport, FaultOutc
 from monstertruckd.tools.drill.summary import by_family, troubles, without_reason
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
-ROOT = Path(__file__).resolve().parents[1]
 OUTPUT = ROOT / "runs" / "benchmarks"
 FAMILY_TRIALS = 10_000
 RECOVERY_GOAL = 2.0

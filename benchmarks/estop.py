@@ -40,6 +40,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import ROOT
 from benchmarks.estop_parts.processes import (
     ORDER_TIMEOUT,
     TO_AND_FRO,
@@ -66,7 +67,6 @@ from monstertruckd.tools.demo.runs import connect, free_endpoint, write_overlay
 from monstertruckd.tools.simulation import simulate
 from monstertruckd.tools.simulation.config import load_simulated
 
-ROOT = Path(__file__).resolve().parents[1]
 FLOODS = ("none", "nonce", "orders", "stops", "rubbish", "calls", "forged")
 QUICK = ("none", "nonce", "rubbish")
 RATE = 10_000

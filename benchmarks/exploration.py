@@ -26,14 +26,12 @@ from typing import Any, Final
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parent))
-
-from exploration_parts import daemon, faults
-from exploration_parts.arena import Arena
-from exploration_parts.generated import generated
-from exploration_parts.offline import offline_tour
-from exploration_parts.rover import SHARES, Rover, Run
-
+from benchmarks import ROOT
+from benchmarks.exploration_parts import daemon, faults
+from benchmarks.exploration_parts.arena import Arena
+from benchmarks.exploration_parts.generated import generated
+from benchmarks.exploration_parts.offline import offline_tour
+from benchmarks.exploration_parts.rover import SHARES, Rover, Run
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.explore.catalog import EXPLORERS
 from monstertruck_planners.explore.config import InformationConfig
@@ -52,7 +50,7 @@ SHIPPED: Final = ("rooms", "corridor_maze", "loop", "yard")
 OURS, PEERS = "information", ("nearest", "author")
 SHORTER = "nearest", "offline"
 """The aim is to be no longer than the shorter one of these."""
-OUT = Path(__file__).resolve().parents[1] / "runs" / "exploration"
+OUT = ROOT / "runs" / "exploration"
 
 
 def main() -> int:
@@ -145,7 +143,7 @@ def whole(arguments: argparse.Namespace) -> tuple[dict[str, float], dict[str, fl
 def file_of(world: str, maps: Path | None) -> Path:
     """Return the file of a world, by the world's name or a file name in the folder."""
     if maps is None or world in SHIPPED:
-        return Path(__file__).resolve().parents[1] / "configs" / "worlds" / f"{world}.yaml"
+        return ROOT / "configs" / "worlds" / f"{world}.yaml"
     return maps / f"{WORLDS.get(world, world)}.yaml"
 
 

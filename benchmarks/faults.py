@@ -16,21 +16,18 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import cache
 from itertools import product
-from pathlib import Path
 
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
+from benchmarks import ROOT
 from benchmarks.fault_parts.scenario import COLUMNS, GOALS, Expect, Reaction, Scenario, cells, measure, shortcomings
 from benchmarks.fault_parts.scenarios import SCENARIOS
 from monstertruck_runtime.clock import run_virtual
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
-ROOT = Path(__file__).resolve().parents[1]
 OUTPUT = ROOT / "runs" / "benchmarks" / "faults.json"
 PHASES = (3.0, 3.0417, 3.0834)
 """Seconds driven before the fault."""

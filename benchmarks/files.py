@@ -28,8 +28,7 @@ import polars as pl
 import pyarrow.parquet as pq
 from ruamel.yaml import YAML
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
+from benchmarks import ROOT
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.path_files import mission_from, path_from
 from monstertruck_schemas import topics as t
@@ -386,8 +385,8 @@ def memory() -> dict[str, dict[str, Any]]:
         file = Path(name) / "run.mcap"
         write_log(file)
         for what in ("parquet", "frames"):
-            words = [sys.executable, __file__, "--read", what, str(file)]
-            done = subprocess.run(words, capture_output=True, text=True, check=True)
+            words = [sys.executable, "-m", "benchmarks.files", "--read", what, str(file)]
+            done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True)
             half, whole = map(float, done.stdout.split())
             growth = 2.0 * (whole - half) / SIZE
             row = {"mb_at_half": half, "mb_at_end": whole, "memory_10gb_mb": round(whole + growth * (10_000 - SIZE), 1)}

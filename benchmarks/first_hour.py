@@ -37,6 +37,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import ROOT
 from benchmarks.estop import Stops
 from benchmarks.estop_parts.processes import order, process
 from monstertruck_runtime.client import TruckClient
@@ -48,7 +49,6 @@ from monstertruckd.tools.demo.runs import connect, free_endpoint, write_overlay
 from tests.daemon.browser_kit import PATIENCE, chromium, opened
 from tests.daemon.page_tasks import TASKS, timed, tried
 
-ROOT = Path(__file__).resolve().parents[1]
 COMMAND = (sys.executable, "-m", "monstertruckd")
 GOALS = {"lap": 20.0, "help": 0.2, "estop": 0.17, "estop_p99": 0.2, "status": 1.0, "goto": 5.0}
 GOALS |= dict.fromkeys(TASKS, 60.0)

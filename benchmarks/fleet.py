@@ -30,6 +30,7 @@ import aiohttp
 import numpy as np
 import zenoh
 
+from benchmarks import ROOT
 from benchmarks.station import cpu
 from benchmarks.station_parts import published
 from monstertruck_runtime.client import TruckClient
@@ -47,7 +48,6 @@ from monstertruckd.tools.demo.runs import free_endpoint, write_overlay
 from monstertruckd.tools.security.folder import Folder
 from monstertruckd.tools.security.router import make_router
 
-ROOT = Path(__file__).parents[1]
 GOALS = {
     "missing": [],
     "added_delay_p99_ms": 10.0,

@@ -30,8 +30,9 @@ from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
-from scoring import rms
 
+from benchmarks import ROOT
+from benchmarks.scoring import rms
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, run_virtual, run_wall
 from monstertruck_runtime.errors import NoAnswerError, NotFoundError, RequestRefusedError
@@ -49,7 +50,6 @@ from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 from tests.fleet_kit import virtual_fleet
 
-ROOT = Path(__file__).resolve().parents[1]
 ROBOTS = {
     "differential": (-2.0, -1.8, 0.0),
     "skid_steer": (2.0, -1.8, 1.57),

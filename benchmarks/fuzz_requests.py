@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 import zenoh
 
+from benchmarks import ROOT
 from benchmarks.estop_parts.processes import order, process
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock, run_wall
@@ -38,7 +39,6 @@ from monstertruck_schemas.state import GateMode
 from monstertruck_schemas.topics import TOPICS, Writer
 from monstertruckd.tools.demo.runs import connect, free_endpoint, write_overlay
 
-ROOT = Path(__file__).resolve().parents[1]
 MOVED = 0.005
 """Metres by which odometry may differ."""
 BODIES: list[dict[str, Any]] = [

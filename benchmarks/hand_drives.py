@@ -28,11 +28,11 @@ from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from hashlib import blake2s
-from pathlib import Path
 from time import perf_counter
 
 import numpy as np
 
+from benchmarks import ROOT
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_runtime.mailbox import latest
@@ -47,7 +47,6 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_ove
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
-ROOT = Path(__file__).resolve().parents[1]
 WORLDS = ("loop", "rooms", "corridor_maze", "hall")
 MODES = {"straight": (0, 0), "front": (1, 0), "rear": (0, 1), "counter": (1, -1), "parallel": (1, 1)}
 """Signs of the axle angles."""

@@ -20,16 +20,13 @@ import json
 import math
 import re
 import subprocess
-import sys
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-ROOT: Final = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-
-from tests.trial_changes import TRIALS  # noqa: E402
+from benchmarks import ROOT
+from tests.trial_changes import TRIALS
 
 PACKAGES: Final = ("monstertruckd", "drivers", "planners", "schemas")
 USERS: Final = (*PACKAGES, "systemd")

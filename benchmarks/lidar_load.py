@@ -10,19 +10,17 @@ Unlike times, two runs count the same. `bytes`: what the lidar sends a second.
 import json
 import logging
 import sys
-from pathlib import Path
 from types import FrameType
 from typing import Any, Final
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
+from benchmarks import ROOT
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
-DEMO: Final = Path(__file__).resolve().parents[1] / "configs" / "demo.yaml"
+DEMO: Final = ROOT / "configs" / "demo.yaml"
 LIDARS: Final[dict[str, dict[str, Any]]] = {
     "urg_04lx": {"kind": "hokuyo_urg"},
     "ld19": {"kind": "ld19"},

@@ -27,8 +27,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from same_python import go_on_in_the_systems_python
 
+from benchmarks.same_python import go_on_in_the_systems_python
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock, run_wall
 from monstertruck_runtime.errors import RequestRefusedError

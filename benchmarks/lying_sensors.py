@@ -36,6 +36,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from benchmarks import ROOT
 from monstertruck_estimation.consistency.comparison import Measure
 from monstertruck_estimation.consistency.config import ConsistencyConfig
 from monstertruck_estimation.consistency.exchange import StepInput
@@ -58,7 +59,7 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_ove
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
-CONFIGS: Final = Path(__file__).resolve().parents[1] / "configs"
+CONFIGS: Final = ROOT / "configs"
 NOTICED: Final = (Reason.SENSORS_DISAGREE, Reason.SENSOR_FROZEN)
 GAP: Final = 0.9
 """Distance of the post from the bumper when the lie begins, m."""

@@ -38,8 +38,6 @@ from typing import Any
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from benchmarks.mutation_parts.equivalents import EQUIVALENTS
 from benchmarks.mutation_parts.mutants import OPERATORS, Mutant, mutants
 from benchmarks.mutation_parts.runner import (

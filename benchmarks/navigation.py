@@ -12,13 +12,12 @@ import json
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent))
-
-from navigation_parts import Options, Part
+from benchmarks import ROOT
+from benchmarks.navigation_parts import Options, Part
 
 FOLDER = Path(__file__).parent / "navigation_parts"
 PARTS = sorted(path.stem for path in FOLDER.glob("*.py") if "\ndef run(" in path.read_text())
-OUT = Path(__file__).resolve().parents[1] / "runs" / "navigation"
+OUT = ROOT / "runs" / "navigation"
 
 
 def main() -> int:

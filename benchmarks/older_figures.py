@@ -12,9 +12,8 @@ import sys
 from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Final
 
-ROOT: Final = Path(__file__).resolve().parents[1]
+from benchmarks import ROOT
 
 
 def git(*words: str) -> str:

@@ -18,13 +18,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from time import monotonic
 
-from service import READY_GOAL, Bench, checkout, copy_tree, deaths, emulated_truck, freezable, judged
-from service_parts.machine import Machine, Output, install_tools, until
-
+from benchmarks import ROOT
+from benchmarks.service import READY_GOAL, Bench, checkout, copy_tree, deaths, emulated_truck, freezable, judged
+from benchmarks.service_parts.machine import Machine, Output, install_tools, until
 from monstertruckd import __version__
 from monstertruckd.bootstrap import EXTRAS, find_uv
 
-ROOT = Path(__file__).resolve().parents[1]
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
 CHECKERS = ("twine", "check-wheel-contents")
 EMULATED = Path("/opt/emulated")

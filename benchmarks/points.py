@@ -28,6 +28,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
+from benchmarks import ROOT
 from monstertruck_drivers.webcam.emulator import jpeg
 from monstertruck_estimation.points.config import PointsConfig
 from monstertruck_estimation.points.exchange import ReadTask
@@ -47,7 +48,6 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_ove
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
-ROOT = Path(__file__).resolve().parents[1]
 OUTPUT = ROOT / "runs" / "benchmarks" / "points.json"
 GOALS = {"recall": 0.95, "false": 0, "position_p95_mm": 50.0}
 WORLDS = ("rooms", "corridor_maze")

@@ -14,10 +14,10 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Final, NamedTuple
 
-ROOT: Final = Path(__file__).resolve().parents[1]
+from benchmarks import ROOT
+
 PATHS: Final = ("monstertruckd", "drivers", "planners", "schemas", "docs", "README.md")
 GOAL: Final = 2.0
 """Maximum rate over all files, per 1000 words."""

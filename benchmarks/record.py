@@ -16,7 +16,8 @@ import sys
 from pathlib import Path
 from typing import Any, Final
 
-ROOT: Final = Path(__file__).resolve().parents[1]
+from benchmarks import ROOT
+
 FOLDER: Final = ROOT / "docs" / "figures"
 
 

@@ -17,12 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks import ROOT
 from monstertruck_drivers.hokuyo_urg.recording import STEPS, RecordedRanges
 from monstertruck_runtime.clock import WallClock, run_wall
 from monstertruck_schemas.sensor import VALID_BEAM
 from monstertruckd.tools.demo.runs import connect, free_endpoint, write_overlay
 
-ROOT = Path(__file__).resolve().parents[1]
 CONFIG = ROOT / "configs" / "recorded-urg.yaml"
 STEP_NS = 1e8 / 1024
 GOALS = {"lost": 0, "wrong_values": 0, "out_of_order": 0, "worst_stamp_ms": 5.0}

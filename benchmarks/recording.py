@@ -32,8 +32,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from same_python import SYSTEM_PYTHON, can_import, go_on_in_the_systems_python
 
+from benchmarks.same_python import SYSTEM_PYTHON, can_import, go_on_in_the_systems_python
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND, WallClock, run_wall
 from monstertruck_schemas.base import Pose2D, Twist2D

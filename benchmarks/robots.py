@@ -18,13 +18,11 @@ import logging
 import math
 import sys
 from collections.abc import Awaitable, Callable
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
+from benchmarks import ROOT
 from benchmarks.scoring import distance, map_error, rms
 from benchmarks.virtual_runs import goal_end
 from monstertruck_planners.collision import DistanceField
@@ -45,7 +43,6 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_ove
 from monstertruckd.tools.simulation.operator import LocalOperator, drive_lap
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
-ROOT: Final = Path(__file__).resolve().parents[1]
 KEPT: Final = ROOT / "runs" / "benchmarks" / "robots.json"
 MAPPING: Final = ("turtle", "truck_today", "f1tenth")
 """Robots with a lidar."""

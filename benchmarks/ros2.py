@@ -36,6 +36,7 @@ import numpy as np
 import zenoh
 from zenoh import ext
 
+from benchmarks import ROOT
 from benchmarks.ros2_parts.all_topics import CONFIG, RATES, Maker, compared
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import WallClock, run_wall
@@ -54,7 +55,6 @@ from monstertruckd.tools.demo.runs import free_endpoint, write_overlay
 from tests.bus_kit import Robot, gate_state, running_robot
 from tests.daemon.wall_kit import kept_armed, planner_ready
 
-ROOT = Path(__file__).parents[1]
 PARTS = "benchmarks.ros2_parts"
 ENDS = {"driven": 4, "cancelled": 5, "refused": 6}
 """Statuses of ``action_msgs`` with which goals are to end."""

@@ -20,8 +20,9 @@ from time import monotonic
 from typing import Any, TypeVar
 
 from mcap.reader import make_reader
-from service_parts.machine import Machine, NotBootedError, Output, install_tools, until
 
+from benchmarks import ROOT
+from benchmarks.service_parts.machine import Machine, NotBootedError, Output, install_tools, until
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.protocol import Control
 from monstertruck_runtime.clock import SECOND
@@ -30,7 +31,6 @@ from monstertruckd.bootstrap import find_uv
 from monstertruckd.host.logging_queue import PRIORITIES
 from monstertruckd.tools.drill.observer import STANDING_SPEED, written
 
-ROOT = Path(__file__).resolve().parents[1]
 PARTS = Path(__file__).resolve().parent / "service_parts"
 SERVICE = "monstertruckd.service"
 PROGRAM, NEXT, NEVER = (Path("/opt") / name for name in ("monstertruckd", "next", "never"))

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import ROOT
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
@@ -35,7 +36,7 @@ from monstertruckd.tools.study.log import Run, read_runs
 from tests.stand_kit import simulated
 from tests.stand_render import level_tag
 
-STAND = Path(__file__).resolve().parents[1] / "configs" / "robots" / "skid_stand.yaml"
+STAND = ROOT / "configs" / "robots" / "skid_stand.yaml"
 REFERENCES = (1.57, 1.25, 1.04)
 RATIOS = (2.0, 3.0, math.inf)
 GOALS = {"radius": 0.01, "speed": 0.01, "drift_share": 0.1, "drift_m_s": 2e-5}

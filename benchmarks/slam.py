@@ -25,14 +25,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parent))
+from benchmarks import ROOT
+
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from slam_parts import accuracy, faults
-from slam_parts.logs import verified
+from benchmarks.slam_parts import accuracy, faults
+from benchmarks.slam_parts.logs import verified
 
 WITHOUT_DATA = {"world", "endurance"}
-OUT = Path(__file__).resolve().parents[1] / "runs" / "slam"
+OUT = ROOT / "runs" / "slam"
 
 
 def _part(name: str) -> Any:

@@ -19,6 +19,7 @@ from time import perf_counter
 
 import numpy as np
 
+from benchmarks import ROOT
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import TruckError
 from monstertruck_sim.faults import hubs_of
@@ -27,7 +28,6 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_ove
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
-ROOT = Path(__file__).resolve().parents[1]
 WARM = 1 / 6
 """Share of the run that does not count."""
 GROWTH = 2.0

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import ROOT
 from monstertruck_drivers.ax12.emulator import TrueJoints
 from monstertruck_estimation.scan_tilt import plane_tilt
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
@@ -24,7 +25,6 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_ove
 from monstertruckd.tools.simulation.operator import LocalOperator, drive_lap
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
-ROOT = Path(__file__).resolve().parents[1]
 RAMP = ROOT / "configs" / "ramp.yaml"
 PICTURES = ROOT / "docs" / "pictures"
 SETTLE, SECONDS = 3.0, 20.0

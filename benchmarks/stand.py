@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from benchmarks import ROOT
 from monstertruck_estimation.vision.blobs import Blob
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND, WallClock
@@ -40,7 +41,7 @@ from tests.stand_kit import LOOK as LOOK_OF_PICTURES
 from tests.stand_kit import simulated, turned
 from tests.stand_render import PictureQuality, StandRenderer, disc_plate, level_tag
 
-OUTPUT = Path(__file__).resolve().parents[1] / "runs" / "benchmarks" / "stand.json"
+OUTPUT = ROOT / "runs" / "benchmarks" / "stand.json"
 GOALS = {
     "position_rms_mm": 5.0,
     "heading_rms_deg": 1.0,

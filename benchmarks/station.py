@@ -26,11 +26,11 @@ from typing import Any
 import aiohttp
 import numpy as np
 
+from benchmarks import ROOT
 from monstertruckd.station.server import Place
 from monstertruckd.tools.demo.runs import free_endpoint
 from tests.daemon.browser_kit import CHROMIUM, chromium, new_tab
 
-ROOT = Path(__file__).parents[1]
 GOALS = {
     "cpu_percent_per_browser": 10.0,
     "map_and_scan_kb_s": 120.0,

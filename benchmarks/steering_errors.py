@@ -19,16 +19,22 @@ import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parent))
-
-from navigation_parts.tracking import ADAPTER, KINDS, PERIOD, RESPONSES, STEP, YARDSTICK, Plant, built_in, route
-from scoring import distance, rms
-
+from benchmarks.navigation_parts.tracking import (
+    ADAPTER,
+    KINDS,
+    PERIOD,
+    RESPONSES,
+    STEP,
+    YARDSTICK,
+    Plant,
+    built_in,
+    route,
+)
+from benchmarks.scoring import distance, rms
 from monstertruck_planners.track.axle_report import report
 from monstertruck_planners.track.catalog import build_tracker
 from monstertruck_planners.track.path_tracker import PathTracker, TruckState

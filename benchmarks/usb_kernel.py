@@ -20,13 +20,12 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from usb_kernel_parts.machine import ADAPTERS, MissingError, booted, initramfs, kernel, require
-
+from benchmarks import ROOT
+from benchmarks.usb_kernel_parts.machine import ADAPTERS, MissingError, booted, initramfs, kernel, require
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.epos.emulator import EposEmulator
 from monstertruck_runtime.clock import WallClock
 
-ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "runs" / "benchmarks" / "usb_kernel"
 LIMIT = 600.0
 """Seconds for everything."""

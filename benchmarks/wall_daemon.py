@@ -22,10 +22,10 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from wall_following import errors_along
-from wall_parts.arena import study
-from wall_parts.daemon import DaemonLap, FaultRun, broken, lap, tuned
 
+from benchmarks.wall_following import errors_along
+from benchmarks.wall_parts.arena import study
+from benchmarks.wall_parts.daemon import DaemonLap, FaultRun, broken, lap, tuned
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.tune.runs import draw
 

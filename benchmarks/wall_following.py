@@ -34,9 +34,9 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from wall_parts.arena import Arena, drawn, start_rule, study
-from wall_parts.simulation import Fault, FaultKind, WallRun, drive_along
 
+from benchmarks.wall_parts.arena import Arena, drawn, start_rule, study
+from benchmarks.wall_parts.simulation import Fault, FaultKind, WallRun, drive_along
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.behave.api import Behaviour
 from monstertruck_planners.behave.wall.config import WallLineConfig, WallPdConfig, WallSwitchingConfig

@@ -27,13 +27,13 @@ from typing import Any
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from same_python import go_on_in_the_systems_python
 
+from benchmarks import ROOT
+from benchmarks.same_python import go_on_in_the_systems_python
 from monstertruck_kinematics.elementary import Array
 from monstertruck_sim.world.raycast import cast_rays, clearance
 from monstertruckd.tools.demo.runs import run_fast_demo
 
-ROOT = Path(__file__).resolve().parents[1]
 CELLS, RESOLUTION = 1000, 0.05
 BEAMS, FIELD = 682, np.radians(239.77)
 REACHES = (5.6, 30.0)

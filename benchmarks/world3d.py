@@ -26,14 +26,15 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from world3d_parts.fleet import fleet
-from world3d_parts.patch import patch
-from world3d_parts.robots import robots
-from world3d_parts.terrain import drilled, rough, slopes
-from world3d_parts.webcam import webcam
 
 import monstertruck_sim.world3d.model as rigid_model
 import monstertruck_sim.world3d.plant as rigid_plant
+from benchmarks import ROOT
+from benchmarks.world3d_parts.fleet import fleet
+from benchmarks.world3d_parts.patch import patch
+from benchmarks.world3d_parts.robots import robots
+from benchmarks.world3d_parts.terrain import drilled, rough, slopes
+from benchmarks.world3d_parts.webcam import webcam
 from monstertruck_kinematics.description import Mechanics
 from monstertruck_kinematics.linkage import common_motion
 from monstertruck_kinematics.polynomials import SteeringPolynomials
@@ -46,7 +47,6 @@ from monstertruck_sim.world3d.picture import WorldRenderer, looking_at
 from monstertruck_sim.world3d.plant import RigidPlant
 from monstertruckd.tools.demo.runs import run_fast_demo
 
-ROOT = Path(__file__).resolve().parents[1]
 SECOND = 1_000_000_000
 RPM = 644 / (2 * pi * 0.075) * 60
 """Speed of the motor (rpm) at one metre per second."""

@@ -16,7 +16,6 @@ that appear under the driving robot, after which it travelled further than it ne
 import argparse
 import json
 import math
-import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -24,8 +23,7 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import binary_dilation, label
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
+from benchmarks import ROOT
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.errors import RequestRefusedError
 from monstertruck_runtime.mailbox import fifo
@@ -39,7 +37,7 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_ove
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
-CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+CONFIGS = ROOT / "configs"
 SIDE, CELL = 8.0, 0.05
 """Sides of the hall and of its cells, m."""
 LENGTH, WIDTH = 0.47, 0.34

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import ROOT
 from monstertruck_drivers.epos.exchange import Exchanger
 from monstertruck_drivers.epos.objects import CONTROLWORD
 from monstertruck_drivers.epos.protocol import Control
@@ -37,7 +38,6 @@ from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 from tests.calibration_kit import START_UP, SilentTruck, SimulatedOperator
 
-ROOT = Path(__file__).resolve().parents[2]
 FIRST, LAST = 2.0, 35.0
 """Seconds after the wizard's start between which it is interrupted: it takes 80 s."""
 ENDED = 40.0

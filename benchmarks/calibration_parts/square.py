@@ -15,6 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from benchmarks import ROOT
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.errors import TruckError
 from monstertruck_schemas import topics
@@ -29,7 +30,6 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 from tests.calibration_kit import START_UP, LocalTruck, hidden, run_session
 
-ROOT = Path(__file__).resolve().parents[2]
 GOAL: Final = 0.2
 """Goal as a share of the closing error with signs alone."""
 SIGNS: Final = ("inverted", "front_direction", "rear_direction")

@@ -22,6 +22,7 @@ from pydantic import TypeAdapter
 from rosbags.rosbag2 import StoragePlugin
 from typer.testing import CliRunner
 
+from benchmarks import ROOT
 from benchmarks.durability_parts import maps
 from benchmarks.durability_parts.damage import made
 from benchmarks.durability_parts.state import missions
@@ -103,8 +104,8 @@ RUN: Final = 1.0
 """Seconds of the log of a drive."""
 AT_ONCE: Final = 1e12
 """Speed of a replay that waits for no message."""
-DATA: Final = Path(__file__).parents[2] / "tests" / "data"
-CONFIGS: Final = Path(__file__).parents[2] / "configs"
+DATA: Final = ROOT / "tests" / "data"
+CONFIGS: Final = ROOT / "configs"
 
 
 class Kind(NamedTuple):

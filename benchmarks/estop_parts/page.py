@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 from playwright.async_api import Page
 
+from benchmarks import ROOT
 from benchmarks.estop_parts.processes import ORDER_TIMEOUT, TO_AND_FRO, on_stderr, order, process
 from monstertruck_drivers.cable import PtyPort
 from monstertruck_drivers.epos import objects as od
@@ -43,7 +44,6 @@ from monstertruckd.tools.simulation import simulate
 from monstertruckd.tools.simulation.config import load_simulated
 from tests.daemon.browser_kit import chromium, opened
 
-ROOT = Path(__file__).resolve().parents[2]
 GOALS = {"click_p99_ms": 60.0, "drive_p99_ms": 75.0, "steering_p99_ms": 30.0, "freeze_max_ms": 350.0, "trials": 500}
 HELD = 0.8
 """Seconds for which speed or steering are held before they are turned round."""

@@ -9,11 +9,11 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 
+from benchmarks import ROOT
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.errors import TruckError
 from monstertruck_schemas.req import Order
 
-ROOT = Path(__file__).resolve().parents[2]
 TO_AND_FRO = {"gate": {"obstacle": {"unseen": "slow"}}}
 """Overlay of a truck that drives to and fro: it has not seen the ground behind it, and stops before that otherwise."""
 ORDER_TIMEOUT = 40.0

@@ -13,10 +13,10 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
-import scoring
 
-from exploration_parts.arena import Arena
-from exploration_parts.rover import SHARES
+from benchmarks import ROOT, scoring
+from benchmarks.exploration_parts.arena import Arena
+from benchmarks.exploration_parts.rover import SHARES
 from monstertruck_estimation.slam.storage import load
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Pose2
@@ -35,7 +35,7 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_ove
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
-CONFIGS: Final = Path(__file__).resolve().parents[2] / "configs"
+CONFIGS: Final = ROOT / "configs"
 OFF: Final = 0.15
 """A wall of a saved map this far from every true one is none, m."""
 HOME: Final = 0.1

@@ -16,8 +16,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from exploration_parts.arena import Arena
-from exploration_parts.daemon import CONFIGS, ExploringTruck, RunRecord, recorded_run
+from benchmarks.exploration_parts.arena import Arena
+from benchmarks.exploration_parts.daemon import CONFIGS, ExploringTruck, RunRecord, recorded_run
 from monstertruck_planners.collision import Footprint
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, TruckError

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from exploration_parts.arena import BODY, Arena
+from benchmarks.exploration_parts.arena import BODY, Arena
 
 RESOLUTION: Final = 0.05
 DOOR, CORRIDOR = (0.9, 1.4), (1.3, 2.2)

@@ -5,8 +5,8 @@ import math
 import numpy as np
 from numba import njit
 
-from exploration_parts.arena import BODY, Arena
-from exploration_parts.rover import DECIDE, Rover, Run
+from benchmarks.exploration_parts.arena import BODY, Arena
+from benchmarks.exploration_parts.rover import DECIDE, Rover, Run
 from monstertruck_estimation.slam.service import grid_message
 from monstertruck_estimation.slam.worker_io import GridPatch
 from monstertruck_planners.explore.api import ExplorationView, Remembered

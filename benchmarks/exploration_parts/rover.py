@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from exploration_parts.arena import BARE, BODY, MOUNT, Arena
+from benchmarks.exploration_parts.arena import BARE, BODY, MOUNT, Arena
 from monstertruck_estimation.slam.config import GridConfig
 from monstertruck_estimation.slam.grid import OccupancyGrid, outline
 from monstertruck_estimation.slam.service import grid_message

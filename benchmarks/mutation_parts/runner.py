@@ -22,13 +22,13 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator
 from importlib.machinery import SourceFileLoader
 from itertools import pairwise
-from pathlib import Path
 from types import CodeType, FunctionType
 from typing import IO, Any, Final
 
 import pytest
 
-ROOT: Final = Path(__file__).resolve().parents[2]
+from benchmarks import ROOT
+
 IMPORTED: Final = (
     "asyncio",
     "hypothesis",

@@ -8,10 +8,10 @@ whether the goal was reached or not.
 
 import numpy as np
 
+from benchmarks.navigation_parts import Options, Part
+from benchmarks.navigation_parts.daemon import CONFIGS, drive, random_goal, reported
 from monstertruck_planners.collision import OCCUPIED, DistanceField
 from monstertruck_runtime.map_files import load_map
-from navigation_parts import Options, Part
-from navigation_parts.daemon import CONFIGS, drive, random_goal, reported
 
 RUNS, QUICK_RUNS = 10, 2
 SECONDS = 120.0

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.navigation_parts import Options, Part
+from benchmarks.navigation_parts.daemon import CONFIGS, pursue
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_runtime.map_files import WorldMap, save_map
@@ -20,8 +22,6 @@ from monstertruck_schemas.reasons import Reason
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
-from navigation_parts import Options, Part
-from navigation_parts.daemon import CONFIGS, pursue
 
 CELL, LENGTH, WALL = 0.025, 5.0, 4
 """Sizes of the map: m, m, and cells."""

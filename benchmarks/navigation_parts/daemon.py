@@ -10,11 +10,12 @@ import asyncio
 import hashlib
 import json
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks import ROOT
+from benchmarks.navigation_parts import Options, Part
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import OCCUPIED, DistanceField, Footprint
 from monstertruck_planners.route.api import RouteMap, Vehicle
@@ -32,9 +33,8 @@ from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
-from navigation_parts import Options, Part
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+CONFIGS = ROOT / "configs"
 RUNS, FURTHER = 40, 40
 LIMIT = 700.0
 POST = 0.1

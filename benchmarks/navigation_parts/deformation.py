@@ -12,15 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from monstertruck_planners.goals.deform_step import Window
-from monstertruck_planners.local.api import LocalPlannerState
-from monstertruck_planners.local.catalog import make_local_planner
-from monstertruck_planners.local.config import LocalPlannerConfig, PublishedConfig, RsbandConfig, TebConfig
-from monstertruck_planners.route.api import Vehicle
-from monstertruck_planners.route.motion import MotionPath
-from monstertruckd.tools.figures import new_figure, write_figure
-from navigation_parts import Options, Part
-from navigation_parts.deformation_world import (
+from benchmarks.navigation_parts import Options, Part
+from benchmarks.navigation_parts.deformation_world import (
     PERIOD,
     SCENARIOS,
     STEP,
@@ -30,6 +23,13 @@ from navigation_parts.deformation_world import (
     Truck,
     World,
 )
+from monstertruck_planners.goals.deform_step import Window
+from monstertruck_planners.local.api import LocalPlannerState
+from monstertruck_planners.local.catalog import make_local_planner
+from monstertruck_planners.local.config import LocalPlannerConfig, PublishedConfig, RsbandConfig, TebConfig
+from monstertruck_planners.route.api import Vehicle
+from monstertruck_planners.route.motion import MotionPath
+from monstertruckd.tools.figures import new_figure, write_figure
 
 STRATEGIES: tuple[Any, ...] = (
     "start_to_end",

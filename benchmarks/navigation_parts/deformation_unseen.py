@@ -8,10 +8,10 @@ import math
 
 import numpy as np
 
+from benchmarks.navigation_parts import Options, Part
+from benchmarks.navigation_parts.deformation import CARS, drive, summary
+from benchmarks.navigation_parts.deformation_world import unseen
 from monstertruck_planners.local.config import LocalPlannerConfig, RsbandConfig, TebConfig
-from navigation_parts import Options, Part
-from navigation_parts.deformation import CARS, drive, summary
-from navigation_parts.deformation_world import unseen
 
 SEEDS = 8
 METHODS: dict[str, LocalPlannerConfig] = {"rsband": RsbandConfig(), "teb": TebConfig()}

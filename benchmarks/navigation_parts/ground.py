@@ -8,11 +8,11 @@ import time
 
 import numpy as np
 
+from benchmarks.navigation_parts import Options, Part
 from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_planners.route.api import RouteMap, Vehicle, warm_up
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.hybrid import HybridPlanner
-from navigation_parts import Options, Part
 
 CELL = 0.05
 ROUGHNESS = (0.01, 0.02, 0.03)

@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import ROOT
+from benchmarks.navigation_parts import Options, Part
 from monstertruck_kinematics.se2 import Pose2
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import OCCUPIED, DistanceField, Footprint
@@ -31,9 +33,8 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import load_map
 from monstertruck_schemas.plan import Path as DrivePath
 from monstertruck_schemas.reasons import Reason
-from navigation_parts import Options, Part
 
-WORLDS = Path(__file__).resolve().parents[2] / "configs" / "worlds"
+WORLDS = ROOT / "configs" / "worlds"
 SHIPPED = ("rooms", "corridor_maze", "loop", "yard")
 TOLERANCE = (0.2, 0.2)
 """Metres and radians."""

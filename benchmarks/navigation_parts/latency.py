@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from navigation_parts import Options, Part
-from navigation_parts.tracking import RESPONSES, built_in, drive, from_data
+from benchmarks.navigation_parts import Options, Part
+from benchmarks.navigation_parts.tracking import RESPONSES, built_in, drive, from_data
 
 KINDS = ("lqr", "mpc")
 SPEEDS = (0.5, 1.0, 1.5)

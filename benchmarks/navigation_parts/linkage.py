@@ -9,11 +9,11 @@ import math
 
 import numpy as np
 
+from benchmarks.navigation_parts import Options, Part
 from monstertruck_kinematics.linkage import common_motion, dragged_speeds
 from monstertruck_kinematics.polynomials import SteeringPolynomials
 from monstertruck_kinematics.truck import FourWheelSteering, LinkedAxles
 from monstertruck_planners.route.api import Vehicle
-from navigation_parts import Options, Part
 
 KNOWN = {(0.4, -0.4): 2.37, (0.36, -0.36): 2.15, (0.4, 0.0): 1.23}
 """Curvatures by the published polynomials, 1/m, by the angles of front and rear axle, rad."""

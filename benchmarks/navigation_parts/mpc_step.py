@@ -17,14 +17,14 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.navigation_parts import Options, Part
+from benchmarks.navigation_parts.tracking import built_in, drive, from_data
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.config import MpcConfig
 from monstertruck_planners.track.error_model import LEAST_LAG
 from monstertruck_planners.track.lqr import GainTable
 from monstertruck_planners.track.mpc import Mpc
 from monstertruck_planners.track.path_tracker import Angles, PathTracker, TrackingState
-from navigation_parts import Options, Part
-from navigation_parts.tracking import built_in, drive, from_data
 
 GENTLE = 1e-6
 APPROACH = 0.3

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.navigation_parts import Options, Part
 from monstertruck_planners.steps import CODEC, DEFORMING, EXPLORING, PLANNING, STEPS, TRACKING
 from monstertruck_runtime.actors.actor import ActorFactory, Placement
 from monstertruck_runtime.actors.remote import RPC, RemoteWorkQueue
 from monstertruck_runtime.clock import Clock, run_wall
-from navigation_parts import Options, Part
 from tests.bus_kit import running_robot
 from tests.unit.runtime.actors.step_kit import deform_tasks, explore_task, numbers, plan_task, track_inputs
 

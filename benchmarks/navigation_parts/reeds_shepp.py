@@ -6,9 +6,9 @@ import time
 import numpy as np
 from ompl import base as ob
 
+from benchmarks.navigation_parts import Options, Part
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.reeds_shepp import ReedsShepp
-from navigation_parts import Options, Part
 
 PAIRS, PATHS = 10_000, 400
 TWO, FOUR = Vehicle.truck("2ws"), Vehicle.truck("4ws")

@@ -13,13 +13,13 @@ import numpy as np
 from ompl import base as ob
 from ompl import util as ou
 
+from benchmarks.navigation_parts import Options, Part
+from benchmarks.navigation_parts.routes import Query, bit_star, read, validity
+from benchmarks.navigation_parts.unseen_maps import free_pose
 from monstertruck_planners.collision import DiscFootprint
 from monstertruck_planners.route.api import RouteMap, Vehicle, warm_up
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.hybrid import HybridPlanner
-from navigation_parts import Options, Part
-from navigation_parts.routes import Query, bit_star, read, validity
-from navigation_parts.unseen_maps import free_pose
 
 MAP = "nav2_100by100_10"
 FOOTPRINT = DiscFootprint((-0.0283, 0.115, 0.2583), 0.1235)

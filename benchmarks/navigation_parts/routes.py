@@ -19,13 +19,13 @@ from ompl import geometric as og
 from ompl import util as ou
 from scipy.ndimage import distance_transform_edt
 
+from benchmarks.navigation_parts import Options, Part, strict
 from monstertruck_planners.collision import DiscFootprint
 from monstertruck_planners.route.api import RouteMap, Vehicle
 from monstertruck_planners.route.hybrid import HybridPlanner
 from monstertruck_runtime.map_files import load_map
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.figures import new_figure, write_figure
-from navigation_parts import Options, Part, strict
 
 TRUCK = Vehicle.truck("4ws")
 WALL = 0.9

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.navigation_parts import Options, Part
+from benchmarks.navigation_parts.unseen_maps import free_pose, unseen_map
 from monstertruck_planners.collision import DiscFootprint
 from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_planners.route.api import RouteMap, Vehicle, warm_up
@@ -17,8 +19,6 @@ from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.hybrid import HybridPlanner
 from monstertruck_planners.route.lattice import LatticePlanner
 from monstertruck_schemas.reasons import Reason
-from navigation_parts import Options, Part
-from navigation_parts.unseen_maps import free_pose, unseen_map
 
 FOOTPRINT = DiscFootprint((-0.0283, 0.115, 0.2583), 0.1235)
 TRUCK, FRONT = Vehicle.truck("4ws"), Vehicle.truck("2ws")

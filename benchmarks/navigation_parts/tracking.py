@@ -20,8 +20,9 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter
 from scipy.spatial import cKDTree
-from scoring import distance, rms
 
+from benchmarks.navigation_parts import Options, Part
+from benchmarks.scoring import distance, rms
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.catalog import AnyTracker, build_tracker
 from monstertruck_planners.track.path_tracker import PathTracker, TruckState
@@ -29,7 +30,6 @@ from monstertruck_planners.track.segments import SegmentedPath
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.figures import new_figure, write_figure
-from navigation_parts import Options, Part
 
 YARDSTICK = FourWheelSteering(wheelbase=0.30, cg_split=1.0)
 TRUCK = FourWheelSteering()

@@ -3,11 +3,11 @@
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path as File
 from typing import Any
 
 import numpy as np
 
+from benchmarks import ROOT
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.base import Message, Pose2D, Twist2D
@@ -41,7 +41,7 @@ RATES: dict[Topic[Any], float] = {
     t.LOG: 2, t.POINTS: 0.5, t.ZONES: 0.5, t.HEALTH: 1, t.GOAL: 2, t.EXPLORE: 2, t.PEERS: 10,
 }  # fmt: skip
 """Messages a second: those of the table of topics, or of a robot that drives. Events have no write end."""
-CONFIG = load_truck(File(__file__).parents[2] / "configs" / "points.yaml")[0]
+CONFIG = load_truck(ROOT / "configs" / "points.yaml")[0]
 """Configuration of the robot."""
 RATIO = CONFIG.geometry.drive_ratio
 CELLS = 200

@@ -19,7 +19,9 @@ import sysconfig
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-INTERFACES = Path(__file__).parents[2] / "monstertruckd" / "ros2" / "interfaces.txt"
+from benchmarks import ROOT
+
+INTERFACES = ROOT / "monstertruckd" / "ros2" / "interfaces.txt"
 
 CMAKE = """cmake_minimum_required(VERSION 3.8)
 project({name})

@@ -6,9 +6,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
-from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from benchmarks import ROOT
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import fifo
@@ -23,7 +23,7 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_ove
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
-CONFIGS: Final = Path(__file__).resolve().parents[2] / "configs"
+CONFIGS: Final = ROOT / "configs"
 CRUISE: Final = 1.2
 """Seconds of driving before a fault."""
 WATCHED: Final = 3.0

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.slam_parts.kiss_alone import KissOdometry
+from benchmarks.slam_parts.logs import Log, load, scored
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.graph import optimise
 from monstertruck_estimation.slam.kiss import KissMatcher
@@ -17,8 +19,6 @@ from monstertruck_estimation.slam.scan_matcher import PlanarMatcher, ScanMatcher
 from monstertruck_estimation.slam.scans import prepare
 from monstertruck_kinematics.se2 import between, compose, transform
 from monstertruckd.tools.figures import new_figure, write_figure
-from slam_parts.kiss_alone import KissOdometry
-from slam_parts.logs import Log, load, scored
 
 GOALS = {
     "intel1.mean": 0.05,

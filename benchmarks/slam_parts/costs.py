@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from numba import njit
 
+from benchmarks import ROOT
 from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.grid import OccupancyGrid
 from monstertruck_estimation.slam.mapping import MappingEstimator
@@ -16,7 +17,6 @@ from monstertruckd.tools.logs.scans import read_scans
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
-ROOT = Path(__file__).resolve().parents[2]
 ROUNDS = 400
 BEAMS, RANGE = 682, 5.6
 DRIVEN = 20.0

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.slam_parts.drawn import PERIOD, REACH, over_drives
 from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.mapping import MappingEstimator
 from monstertruck_estimation.slam.scans import ScanGeometry, prepare_input
 from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_kinematics.se2 import between, compose
 from monstertruck_schemas.health import LocalisationStatus, OdometryUse
-from slam_parts.drawn import PERIOD, REACH, over_drives
 
 SHARES = (0.1, 0.2, 0.3, 0.4)
 SEEDS = 5

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks import ROOT
+from benchmarks.slam_parts.world_drives import ROOMS
 from monstertruck_estimation.slam.config import SlamConfig
 from monstertruck_estimation.slam.worker import SlamWorker
 from monstertruck_estimation.slam.worker_io import ScanInput, Start, WorkerInput
@@ -17,9 +19,8 @@ from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.map_files import OCCUPIED, load_map
 from monstertruck_sim.world.raycast import cast_rays, clearance
-from slam_parts.world_drives import ROOMS
 
-MAP = Path(__file__).resolve().parents[2] / "configs" / "worlds" / "rooms.yaml"
+MAP = ROOT / "configs" / "worlds" / "rooms.yaml"
 HOURS, SPEED, PERIOD = 2.0, 0.3, 0.1
 BEAMS, RANGE = 682, 5.6
 ANGLES = np.deg2rad(np.linspace(-120, 120, BEAMS))

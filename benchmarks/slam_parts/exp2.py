@@ -29,6 +29,7 @@ import numpy as np
 from kiss_icp.config import KISSConfig
 from kiss_icp.kiss_icp import KissICP
 
+from benchmarks import ROOT
 from monstertruck_drivers.hokuyo_urg.recording import RecordedRanges
 from monstertruck_estimation.slam.config import GridConfig, SlamConfig
 from monstertruck_estimation.slam.grid import OccupancyGrid
@@ -47,7 +48,6 @@ from monstertruckd.tools.figures import new_figure, write_figure
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
-ROOT = Path(__file__).resolve().parents[2]
 CONFIG = ROOT / "configs" / "recorded-urg.yaml"
 RENDERED = 4.0
 """Longest range that is drawn, m."""

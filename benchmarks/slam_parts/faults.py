@@ -24,12 +24,12 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.slam_parts.logs import Log, load, scored
 from monstertruck_estimation.slam.mapping import Mapper
 from monstertruck_estimation.slam.scans import prepare
 from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.health import OdometryUse
-from slam_parts.logs import Log, load, scored
 
 Found = tuple[dict[str, float], dict[str, float], bool]
 

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.slam_parts.logs import Log, load
 from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.grid import GridBuilder
 from monstertruck_estimation.slam.localisation import LocalisationEstimator, submap_of
@@ -24,7 +25,6 @@ from monstertruck_estimation.slam.storage import SavedGraph, SavedMap, trinary
 from monstertruck_estimation.slam.worker_io import ScanInput, SlamEstimate
 from monstertruck_kinematics.se2 import between
 from monstertruck_schemas.health import MATCHED, LocalisationStatus
-from slam_parts.logs import Log, load
 
 STRETCHES = ((0.0, 0.25), (0.3, 0.55))
 """Shares of the log that are mapped, one after the other for the variants."""

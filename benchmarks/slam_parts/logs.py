@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.slam_parts import drawn
 from monstertruck_estimation.slam.scans import ScanGeometry
 from monstertruck_kinematics.se2 import between, interpolate
 from monstertruck_runtime.clock import SECOND
-from slam_parts import drawn
 
 MANIFEST = {
     "intel.npz": (

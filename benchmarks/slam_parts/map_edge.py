@@ -12,14 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.slam_parts.localisation import PLACED, Mapped, error, mapped, truth
+from benchmarks.slam_parts.logs import load
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.localisation import LocalisationEstimator, submap_of
 from monstertruck_estimation.slam.registration import measure
 from monstertruck_estimation.slam.scans import prepare, prepare_input
 from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_kinematics.se2 import between
-from slam_parts.localisation import PLACED, Mapped, error, mapped, truth
-from slam_parts.logs import load
 
 LOGS = ("intel1", "csail")
 STRETCHES = ((0.0, 0.25), (0.3, 0.55), (0.5, 0.75))

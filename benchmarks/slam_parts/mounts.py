@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.slam_parts.drawn import PERIOD, over_drives
 from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.mapping import MappingEstimator
 from monstertruck_estimation.slam.mount import mount_of
 from monstertruck_estimation.slam.scans import prepare_input
 from monstertruck_estimation.slam.worker_io import ScanInput
-from slam_parts.drawn import PERIOD, over_drives
 
 KINDS = ("right", "2", "-5", "10", "mirrored", "late")
 """Turned by degrees, beams in reverse, or seen ``PERIOD`` seconds later than stamped."""

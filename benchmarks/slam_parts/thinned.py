@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.slam_parts.logs import deviation, load, scored
 from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.mapping import MappingEstimator
 from monstertruck_estimation.slam.scans import prepare_input
@@ -20,7 +21,6 @@ from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_kinematics.se2 import between, compose, interpolate
 from monstertruck_schemas.health import LocalisationStatus
 from monstertruckd.tools.logs.scans import read_scans
-from slam_parts.logs import deviation, load, scored
 
 LOGS = ("aces", "csail", "exp2", "intel")
 EXP2 = "urg04lx_exp2.dat.gz"

@@ -15,6 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks import ROOT
+from benchmarks.slam_parts.world_drives import BEAM, SCENARIOS, SWEEP, Drive, draw_corridor, driven
 from monstertruck_estimation.fusion.config import FusionConfig
 from monstertruck_estimation.fusion.estimator import Fusion
 from monstertruck_estimation.odometry import DeadReckoning, OdometryConfig, OdometryEstimator
@@ -34,7 +36,6 @@ from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedbac
 from monstertruck_schemas.state import ScanMotion
 from monstertruck_sim.world.config import SimTruckConfig
 from monstertruckd.tools.figures import new_figure, write_figure
-from slam_parts.world_drives import BEAM, SCENARIOS, SWEEP, Drive, draw_corridor, driven
 
 SEEDS, QUICK_SEEDS = 10, 2
 LATENCY = 3 * SECOND // 100
@@ -48,7 +49,7 @@ SUBSETS = {
     "scans": ("scans",),
     "all": ("drive", "compass", "scans"),
 }
-PLAIN = Path(__file__).resolve().parents[2] / "configs" / "worlds" / "rooms.yaml"
+PLAIN = ROOT / "configs" / "worlds" / "rooms.yaml"
 STARTED = 2.0
 """Seconds in which nothing is evaluated."""
 GOALS = {

@@ -15,10 +15,11 @@ import sys
 import time
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmarks import ROOT
+
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from navigation_parts import Options, Part
+from benchmarks.navigation_parts import Options, Part
 
 EXPERIMENTS = {
     "5.1": "kinematics",
@@ -29,7 +30,7 @@ EXPERIMENTS = {
     "5.6": "exploration",
     "5.7": "computer",
 }
-OUT = Path(__file__).resolve().parents[2] / "runs" / "thesis"
+OUT = ROOT / "runs" / "thesis"
 HEAD = """<!doctype html>
 <html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{title}</title>
 <style>

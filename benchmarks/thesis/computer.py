@@ -15,10 +15,10 @@ import resource
 from typing import Any
 
 import numpy as np
-import scoring
-from navigation_parts import Options, Part
-from navigation_parts.daemon import CONFIGS
 
+from benchmarks import scoring
+from benchmarks.navigation_parts import Options, Part
+from benchmarks.navigation_parts.daemon import CONFIGS
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import RequestRefusedError
 from monstertruck_runtime.slowness import BOARDS

@@ -6,11 +6,11 @@ The closed loop of the navigation benchmark (kinematic truck, emulated lidar); e
 from collections.abc import Iterable
 
 import numpy as np
-import scoring
-from navigation_parts import Options, Part
-from navigation_parts.deformation import CARS, LIMIT, drive
-from navigation_parts.deformation_world import SCENARIOS, SIZE
 
+from benchmarks import scoring
+from benchmarks.navigation_parts import Options, Part
+from benchmarks.navigation_parts.deformation import CARS, LIMIT, drive
+from benchmarks.navigation_parts.deformation_world import SCENARIOS, SIZE
 from monstertruck_planners.local.config import PublishedConfig, RsbandConfig, TebConfig
 from monstertruckd.tools.figures import new_figure, write_figure
 

@@ -4,12 +4,12 @@ The light harness of the exploration benchmark: real grid, exploring step and ro
 """
 
 import numpy as np
-import scoring
-from exploration_parts.arena import Arena
-from exploration_parts.rover import SPEED, Rover
-from navigation_parts import Options, Part
-from navigation_parts.harness import WORLDS
 
+from benchmarks import scoring
+from benchmarks.exploration_parts.arena import Arena
+from benchmarks.exploration_parts.rover import SPEED, Rover
+from benchmarks.navigation_parts import Options, Part
+from benchmarks.navigation_parts.harness import WORLDS
 from monstertruck_planners.explore.catalog import EXPLORERS
 from monstertruck_planners.explore.explore_step import warm_up
 from monstertruckd.tools.figures import new_figure, write_figure

@@ -11,10 +11,10 @@ import math
 from typing import Any
 
 import numpy as np
-import scoring
-from navigation_parts import Options, Part
-from navigation_parts.daemon import CONFIGS
 
+from benchmarks import scoring
+from benchmarks.navigation_parts import Options, Part
+from benchmarks.navigation_parts.daemon import CONFIGS
 from monstertruck_kinematics.polynomials import SteeringPolynomials
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual

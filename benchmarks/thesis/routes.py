@@ -7,11 +7,11 @@ of the true footprint in the world; curvature is relative to the tightest that t
 import time
 
 import numpy as np
-import scoring
-from exploration_parts.arena import BARE, Arena
-from navigation_parts import Options, Part
-from navigation_parts.harness import WORLDS
 
+from benchmarks import scoring
+from benchmarks.exploration_parts.arena import BARE, Arena
+from benchmarks.navigation_parts import Options, Part
+from benchmarks.navigation_parts.harness import WORLDS
 from monstertruck_planners.route.api import RouteMap, Vehicle, make_planner
 from monstertruck_planners.route.config import GridAstarConfig, HybridConfig, LatticeConfig
 from monstertruckd.tools.figures import new_figure, write_figure

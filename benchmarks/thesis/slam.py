@@ -7,11 +7,11 @@ Compares the pose by scan matching and loop closures with dead reckoning alone, 
 from typing import Any
 
 import numpy as np
-import scoring
-from exploration_parts.arena import Arena
-from navigation_parts import Options, Part
-from navigation_parts.daemon import CONFIGS
 
+from benchmarks import scoring
+from benchmarks.exploration_parts.arena import Arena
+from benchmarks.navigation_parts import Options, Part
+from benchmarks.navigation_parts.daemon import CONFIGS
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_schemas import topics
 from monstertruckd.config.load import load_config

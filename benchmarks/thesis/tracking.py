@@ -7,9 +7,9 @@ heading error is then the turn of the path.
 """
 
 import numpy as np
-from navigation_parts import Options, Part
-from navigation_parts.tracking import TRUCK, Result, built_in, drive
 
+from benchmarks.navigation_parts import Options, Part
+from benchmarks.navigation_parts.tracking import TRUCK, Result, built_in, drive
 from monstertruckd.tools.figures import new_figure, write_figure
 
 MODES = ("front", "counter", "crab", "hybrid")

@@ -5,8 +5,8 @@ import os
 import subprocess
 import sys
 
-from usb_kernel_parts.inside import Loop, joystick, save, udev
-from usb_kernel_parts.situations import run_all
+from benchmarks.usb_kernel_parts.inside import Loop, joystick, save, udev
+from benchmarks.usb_kernel_parts.situations import run_all
 
 
 def main() -> int:

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import serial
 
+from benchmarks.usb_kernel_parts.inside import ask, situation, until
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.computer import ROOT, Machine, open_watcher
 from monstertruck_drivers.epos.config import EposConfig
@@ -51,7 +52,6 @@ from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.doctor.context import HostContext, inspect
 from monstertruckd.tools.doctor.devices import handshakes, wiring
 from monstertruckd.tools.install.files import Program, rules_text
-from usb_kernel_parts.inside import ask, situation, until
 
 CLOCK = WallClock()
 MACHINE = Machine(CLOCK)
@@ -482,7 +482,7 @@ def truck() -> TruckConfig:
         devices += f'  {role}: {{ port: {{ hub: "{parent_of(name)}", port: {port_of(name)} }}{driver} }}\n'
     folder = Path("/run/truck")
     folder.mkdir(exist_ok=True)
-    root = Path(__file__).resolve().parents[2]
+    root = ROOT
     file = folder / "truck.yaml"
     file.write_text(f"include: {root}/configs/parts/chassis.yaml\nversion: 2\ndevices:\n{devices}\n")
     return load_config(file, TruckConfig)[0]

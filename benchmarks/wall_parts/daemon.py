@@ -10,7 +10,10 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from benchmarks import ROOT
 from benchmarks.virtual_runs import behaviour_run
+from benchmarks.wall_parts.arena import Arena, study
+from benchmarks.wall_parts.simulation import mirrored
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import TruckError
@@ -26,10 +29,8 @@ from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 from monstertruckd.tools.tune.recipe import WallGains
 from monstertruckd.tools.tune.runs import Tuning, TuningRun, tune
-from wall_parts.arena import Arena, study
-from wall_parts.simulation import mirrored
 
-FILE: Final = Path(__file__).resolve().parents[2] / "configs" / "robots" / "sonar.yaml"
+FILE: Final = ROOT / "configs" / "robots" / "sonar.yaml"
 CELL: Final = 0.01
 """Cell size of the map, m: walls at a slant are steps of this size."""
 LAP: Final = 20.0, 1.0

@@ -13,6 +13,7 @@ from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 
+from benchmarks.wall_parts.arena import Arena, blocked, rays
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.profiles import TimedRamp
 from monstertruck_planners.behave.api import Behaviour, Inputs, RequestedMotion
@@ -24,7 +25,6 @@ from monstertruck_schemas.state import Odometry, Transform, Transforms
 from monstertruck_schemas.topics import IMU, ODOMETRY, SONAR, TRANSFORMS
 from monstertruck_sim.world.config import FIVE_SONARS, SonarModelConfig
 from tests.sonar_kit import survey
-from wall_parts.arena import Arena, blocked, rays
 
 FINE: Final = 0.01
 SONAR_PERIOD: Final = 10

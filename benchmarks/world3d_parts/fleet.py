@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.world3d_parts.terrain import CONFIGS
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
@@ -17,7 +18,6 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_ove
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 from tests.fleet_kit import virtual_fleet
-from world3d_parts.terrain import CONFIGS
 
 PEOPLE = (
     {"waypoints": ({"x": 0.6, "y": 2.4}, {"x": 0.6, "y": -2.4}), "speed": 0.5, "before": "stop"},

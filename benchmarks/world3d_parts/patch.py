@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from benchmarks.world3d_parts.terrain import CONFIGS, run
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.mailbox import latest
@@ -20,7 +21,6 @@ from monstertruck_schemas.state import GROUND_UNKNOWN, ROUGHNESS_STEP, Ground
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.drill.truck import DrillTruck
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
-from world3d_parts.terrain import CONFIGS, run
 
 ENDS = (0.5, 6.0)
 """Places along x between which the truck drives to and fro, m."""

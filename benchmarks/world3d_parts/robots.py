@@ -1,11 +1,11 @@
 """Every body with rigid wheels drives its bend, and the robot with five sonars follows a wall."""
 
 from math import dist
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks import ROOT
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
@@ -16,7 +16,7 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_ove
 from monstertruckd.tools.simulation.operator import Lap, LocalOperator, drive_lap
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
-ROBOTS = Path(__file__).resolve().parents[2] / "configs" / "robots"
+ROBOTS = ROOT / "configs" / "robots"
 BODIES = ("truck", "ackermann", "skid_steer", "differential", "omni", "mecanum")
 END = (2.4, 4.15)
 """End of the bend, m."""

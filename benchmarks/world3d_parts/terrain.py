@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
-from scoring import rms
 
+from benchmarks import ROOT
+from benchmarks.scoring import rms
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.map_files import OCCUPIED
@@ -27,7 +28,7 @@ from monstertruckd.tools.drill.random_drill import Drill
 from monstertruckd.tools.drill.truck import DrillTruck
 from monstertruckd.tools.simulation.config import DEADMAN_LINE, SimulatedTruckConfig, with_overlay
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+CONFIGS = ROOT / "configs"
 ROUGH_DEG = 5.0
 """RMS of the ground's slope."""
 WAVE = 1.5

@@ -2,13 +2,13 @@
 
 import time
 
+from benchmarks.world3d_parts.terrain import CONFIGS, run
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
 from monstertruck_schemas.req import Order
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.drill.truck import DrillTruck
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
-from world3d_parts.terrain import CONFIGS, run
 
 RATE = 15
 OVERLAY = {
