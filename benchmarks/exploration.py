@@ -34,7 +34,7 @@ from benchmarks.exploration_parts.offline import offline_tour
 from benchmarks.exploration_parts.rover import SHARES, Rover, Run
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.explore.catalog import EXPLORERS
-from monstertruck_planners.explore.config import InformationConfig
+from monstertruck_planners.explore.config import ExplorerConfig, InformationConfig
 from monstertruck_planners.explore.exchange import ExploreSetup, ExploreTask
 from monstertruck_planners.explore.explore_step import ExploringStep, warm_up
 from monstertruck_schemas.base import Pose2D
@@ -151,7 +151,9 @@ def run_of(arena: Arena, kind: str, reach: float, seed: int) -> Run:
     """Run one exploration."""
     if kind == "offline":
         return offline_tour(arena, reach, seed)
-    return Rover(arena, EXPLORERS[kind].settings_class().model_validate({"reach": reach}), seed).explore()
+    config = EXPLORERS[kind].settings_class().model_validate({"reach": reach})
+    assert isinstance(config, ExplorerConfig)
+    return Rover(arena, config, seed).explore()
 
 
 def row_of(run: Run) -> dict[str, Any]:

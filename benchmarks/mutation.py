@@ -38,6 +38,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import ROOT
 from benchmarks.mutation_parts.equivalents import EQUIVALENTS
 from benchmarks.mutation_parts.mutants import OPERATORS, Mutant, mutants
 from benchmarks.mutation_parts.runner import (
@@ -45,7 +46,6 @@ from benchmarks.mutation_parts.runner import (
     COLD,
     KILLED,
     OPTIONS,
-    ROOT,
     SURVIVED,
     TIMED_OUT,
     Server,

@@ -177,8 +177,8 @@ def learn(run: Drive, each: Callable[[Drive], None] = lambda _: None) -> tuple[f
         run.lap(each)
     after = run.metres
     run.lap(each)
-    early = [error for at, error in run.errors if at < LEARNING]
-    return rms(early), rms([error for at, error in run.errors if at >= after])
+    at, errors = np.array(run.errors).T
+    return rms(errors[at < LEARNING]), rms(errors[at >= after])
 
 
 def errors(figures: dict[str, float], goals: dict[str, float]) -> None:

@@ -23,7 +23,7 @@ def run(options: Options) -> Part:
     truth = DistanceField((world.cells >= OCCUPIED) | (world.cells < 0), world.resolution, (*world.origin, 0.0))
     rows: dict[str, list] = {name: [] for name in BASES}
     for number in range(QUICK_RUNS if options.quick else RUNS):
-        goal = random_goal(truth, np.array(world.origin), world.size, np.random.default_rng([2, number]))
+        goal = random_goal(truth, np.array(world.origin), np.array(world.size), np.random.default_rng([2, number]))
         for name, base in BASES.items():
             rows[name].append(row := drive(goal, number, surprise=False, base=base, seconds=SECONDS) | {"equal": True})
             print(f"{number:3} {name:10} {np.round(goal, 2)} {reported(row)}", flush=True)

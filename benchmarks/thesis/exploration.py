@@ -11,6 +11,7 @@ from benchmarks.exploration_parts.rover import SPEED, Rover
 from benchmarks.navigation_parts import Options, Part
 from benchmarks.navigation_parts.harness import WORLDS
 from monstertruck_planners.explore.catalog import EXPLORERS
+from monstertruck_planners.explore.config import ExplorerConfig
 from monstertruck_planners.explore.explore_step import warm_up
 from monstertruckd.tools.figures import new_figure, write_figure
 
@@ -46,10 +47,12 @@ def run(options: Options) -> Part:
 
 
 def one(arena: Arena, kind: str, car: str, seed: int) -> tuple[dict[str, float], np.ndarray]:
-    rover = Rover(arena, EXPLORERS[kind].settings_class().model_validate({"reach": REACH}), seed, steering=car)
+    config = EXPLORERS[kind].settings_class().model_validate({"reach": REACH})
+    assert isinstance(config, ExplorerConfig)
+    rover = Rover(arena, config, seed, steering=car)
     done = rover.explore()
     patch = rover.grid.patch()
-    error = scoring.map_error(patch.cells, tuple(patch.origin), patch.resolution, arena.truth)
+    error = scoring.map_error(patch.cells, patch.origin, patch.resolution, arena.truth)
     metres = {f"metres_{round(100 * share)}": done.metres.get(share, done.driven) for share in (0.9, 0.95, 0.99)}
     return metres | {
         "driven_m": done.driven, "time_s": done.driven / SPEED, "covered_share": done.covered, "goals": done.goals,
