@@ -14,10 +14,23 @@ def main() -> None:
     if sys.argv[1:2] == ["run"]:
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: os._exit(0))
+    _occupy_standard_streams()
     with _early(sys.argv[1:]):
         from monstertruckd.tools.cli.entry import main as command_line  # noqa: PLC0415 - takes its time
 
         command_line()
+
+
+def _occupy_standard_streams() -> None:
+    """Open the null device in place of closed standard streams.
+
+    Otherwise the next file or socket gets the number of a stream: messages would be written to it, and libuv aborts.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number
 
 
 def _early(arguments: list[str]) -> AbstractContextManager[None]:

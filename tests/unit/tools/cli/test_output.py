@@ -203,6 +203,13 @@ def test_remarks_never_stand_among_results():
     assert (done.returncode, done.stdout) == (Reason.NOT_FOUND.exit_code, "")
 
 
+def test_a_closed_stream_leaves_its_number_to_no_file():
+    """Libuv aborts if a socket of the event loop gets the number of a standard stream."""
+    code = "import os; from monstertruckd import __main__ as m; m._occupy_standard_streams(); os._exit(os.dup(0))"
+    done = subprocess.run(["sh", "-c", f'exec {sys.executable} -c "{code}" <&- >&- 2>&-'], cwd=ROOT, check=False)
+    assert done.returncode == 3
+
+
 @pytest.mark.parametrize("words", [[], ["status"], ["log"], ["log", "list"], ["goto"]])
 def test_h_is_help_everywhere(words: list[str], capsys: pytest.CaptureFixture[str]):
     texts = []
