@@ -6,7 +6,9 @@ before anything is decompressed or loaded.
 """
 
 import gzip
+import re
 import warnings
+import xml.etree.ElementTree as ET
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -121,6 +123,18 @@ def text_from(data: bytes, file: Path, expected: str, refusal: type[TruckError] 
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
         raise refusal(f"{file}:{line}: expected {expected}: not UTF-8 text") from error
+
+
+def xml_from(text: str, file: Path, expected: str) -> ET.Element:
+    """Parse XML without declarations of entities, which could expand to any size.
+
+    Raises:
+        InputError: it is not XML, or declares entities.
+    """
+    if "<!" in re.sub(r"<!--.*?-->|<!DOCTYPE\s+\w+\s*>", "", text, flags=re.DOTALL):
+        raise InputError(f"{file}: declares entities: expected {expected} without them")
+    with reading(file, expected):
+        return ET.fromstring(text)  # noqa: S314 - without entities
 
 
 def lines_of(file: Path, expected: str, most: int = MOST_UNPACKED) -> Iterator[str]:

@@ -4,6 +4,7 @@ All formats measure pixel coordinates from the centre of the first pixel, as ``L
 """
 
 import re
+import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -12,7 +13,7 @@ import numpy as np
 from ruamel.yaml.error import YAMLError
 
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.outside import quoted, reading
+from monstertruck_runtime.outside import quoted, reading, xml_from
 from monstertruck_runtime.yaml_files import bounded_yaml, yaml_text
 from monstertruck_schemas.body import LensConfig
 from monstertruckd.tools.calibrate.lens_forms import LensForm
@@ -20,6 +21,7 @@ from monstertruckd.tools.calibrate.lens_forms import LensForm
 EXPECTED: Final = "camera intrinsics"
 _PINHOLE: Final = ("plumb_bob", "rational_polynomial", "radtan", "none", "")
 """Names of the pinhole model with Brown's distortion; the additional terms of a rational model must be 0."""
+_NUMBER: Final = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
 _OPENCV: Final = (
     ("camera_matrix", "distortion_coefficients"),
     ("cameraMatrix", "distCoeffs"),
@@ -100,7 +102,9 @@ def _opencv(name: str, rows: int, columns: int, data: list[float]) -> str:
 
 
 def _data(text: str, file: Path) -> Mapping[str, Any]:
-    """Mapping in a YAML file, or in an OpenCV file, whose first line and tags are not valid YAML."""
+    """Mapping in a YAML file, or in an OpenCV file: XML, JSON, or YAML whose first line and tags are not valid YAML."""
+    if text.lstrip("\ufeff \r\n").startswith("<"):
+        return _storage(xml_from(text, file, EXPECTED), file)
     plain = re.sub(r"!!opencv-matrix\b", "", re.sub(r"\A\ufeff?%YAML[^\n]*\n(---[^\n]*\n)?", "", text))
     documents = [part for part in plain.split("\n---") if part.strip("- \n")]
     with reading(file, EXPECTED):
@@ -112,6 +116,21 @@ def _data(text: str, file: Path) -> Mapping[str, Any]:
     if not isinstance(data, dict):
         raise InputError(f"{file}: expected {EXPECTED}: a mapping")
     return data
+
+
+def _storage(root: ET.Element, file: Path) -> dict[str, Any]:
+    """Values of an OpenCV storage in XML: matrices and plain values by name."""
+    if root.tag != "opencv_storage":
+        raise InputError(f"{file}: expected {EXPECTED}: an element opencv_storage, found {root.tag}")
+    found: dict[str, Any] = {}
+    for element in root:
+        if element.get("type_id") == "opencv-matrix":
+            words = (element.findtext("data") or "").split()
+            found[element.tag] = {"data": [float(word) if _NUMBER.fullmatch(word) else word for word in words]}
+        else:
+            text = (element.text or "").strip()
+            found[element.tag] = int(text) if re.fullmatch(r"[0-9]{1,9}", text) else text
+    return found
 
 
 def _chosen(chain: Mapping[str, Any], camera: str | None, file: Path) -> Mapping[str, Any]:
@@ -151,7 +170,8 @@ def _numbers(value: Any) -> Any:
 
 
 def _floats(values: Any, count: int, name: str, file: Path) -> list[float]:
-    numbers = np.ravel(np.asarray(values, np.float64)).tolist()
+    with reading(f"{file}: {name}", f"{count} numbers"):
+        numbers = np.ravel(np.asarray(values, np.float64)).tolist()
     if len(numbers) != count:
         raise InputError(f"{file}: {name}: expected {count} numbers, found {len(numbers)}")
     return [float(value) for value in numbers]

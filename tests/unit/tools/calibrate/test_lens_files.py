@@ -45,6 +45,33 @@ def test_each_form_is_the_same_lens(text: str):
     assert read(text) == LENS
 
 
+@pytest.mark.parametrize("ending", ["yml", "xml", "json"])
+def test_a_lens_in_each_of_opencvs_file_formats_is_read(tmp_path: Path, ending: str):
+    file = tmp_path / f"cv.{ending}"
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+    storage.write("calibration_time", "Tue 01 Dec 2026")
+    storage.write("image_width", 800)
+    storage.write("image_height", 600)
+    storage.write("camera_matrix", np.array([[610.5, 0, 401.5], [0, 612.25, 298.75], [0, 0, 1]]))
+    storage.write("distortion_coefficients", np.array([[-0.3, 0.1, 1e-3, -2e-3, 0.0]]))
+    storage.release()
+    assert lens_from(file.read_text(), file) == LENS
+
+
+@pytest.mark.parametrize(
+    ("text", "refusal"),
+    [
+        ("<robot/>", "an element opencv_storage, found robot"),
+        ("<opencv_storage><camera_matrix>", "no element found"),
+        ('<!DOCTYPE a [<!ENTITY b "c">]><opencv_storage/>', "declares entities"),
+        ('<opencv_storage><K type_id="opencv-matrix"><data>1 a</data></K></opencv_storage>', "K: expected 9 numbers"),
+    ],
+)
+def test_another_xml_file_is_refused(text: str, refusal: str):
+    with pytest.raises(InputError, match=refusal):
+        read(text)
+
+
 def test_what_opencv_writes_is_read_and_what_we_write_is_read_by_opencv(tmp_path: Path):
     storage = cv2.FileStorage(str(tmp_path / "cv.yml"), cv2.FILE_STORAGE_WRITE)
     matrix = np.array([[610.5, 0, 401.5], [0, 612.25, 298.75], [0, 0, 1]])
@@ -84,7 +111,7 @@ def test_one_camera_of_a_chain_is_chosen():
         ("a: 1\n", "expected camera intrinsics: a camera_matrix"),
         ("- 1\n", "expected camera intrinsics: a mapping"),
         ("a: [\n", "not valid YAML"),
-        (ECHOED.replace("[610.5", "[a"), "expected camera intrinsics"),
+        (ECHOED.replace("[610.5", "[a"), "k: expected 9 numbers"),
     ],
 )
 def test_other_lenses_are_refused_by_name(text: str, refusal: str):
