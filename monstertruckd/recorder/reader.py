@@ -123,9 +123,11 @@ class LogReader:
         self.log_offset = 0
         """Log times minus daemon times (ns), known after an iteration has passed the metadata."""
         with open_file(path) as file:
-            head = file.read(len(MAGIC))
-            if not MAGIC.startswith(head) and (not _resembles(head) or Salvage(file).strange):
-                raise InputError(f"{path}: not an MCAP log")
+            head = file.read(32)  # bytes that tell the formats apart
+            magic = head[: len(MAGIC)]
+            if not MAGIC.startswith(magic) and (not _resembles(magic) or Salvage(file).strange):
+                other = next((f" but {text}" for begin, text in OTHERS.items() if head.startswith(begin)), "")
+                raise InputError(f"{path}: not an MCAP log{other}")
 
     def __iter__(self) -> Iterator[LogMessage]:
         return self._messages(self.records())
@@ -313,6 +315,24 @@ class LogReader:
     def metadata(self) -> dict[str, dict[str, str]]:
         """Return the metadata records of the preamble, by name."""
         return {record.name: dict(record.metadata) for record in self.preamble() if isinstance(record, Metadata)}
+
+
+STRANGERS: Final = {
+    b"version https://git-lfs": "a git-LFS pointer, not the file itself: fetch it with `git lfs pull`",
+    b"\x1f\x8b": "compressed with gzip: decompress it first (CARMEN and URG text may stay compressed as NAME.gz)",
+    b"BZh": "compressed with bzip2: decompress it first",
+    b"\xfd7zXZ": "compressed with xz: decompress it first",
+    b"\x28\xb5\x2f\xfd": "compressed with zstd: decompress it first",
+    b"7z\xbc\xaf": "a 7z archive: unpack it first",
+}
+"""Formats that every reader of logs rejects, by their first bytes."""
+OTHERS: Final = STRANGERS | {
+    b"#ROSBAG": "a ROS 1 bag; `monstertruckd map build` reads its scans",
+    b"SQLite format 3": "the database of a ROS 2 bag; `monstertruckd map build` reads its scans",
+    b"PAR1": "a Parquet table",
+    b"PK\x03\x04": "a zip archive, as npz files are",
+}
+"""Formats that are not MCAP, by their first bytes, as the end of an error message."""
 
 
 def _resembles(head: bytes) -> bool:

@@ -20,7 +20,7 @@ from monstertruck_runtime.small_files import require_file
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.topics import ODOMETRY, SCAN
 from monstertruckd.recorder.frames import MAGIC
-from monstertruckd.recorder.reader import LogReader, open_log
+from monstertruckd.recorder.reader import STRANGERS, LogReader, open_log
 from monstertruckd.tools.logs.bag_scans import scans_of
 from monstertruckd.tools.logs.bags import METADATA, content_of, mcap_messages
 from monstertruckd.tools.logs.carmen import read_carmen
@@ -39,15 +39,6 @@ BAG: Final = b"#ROSBAG V"
 DATABASE: Final = b"SQLite format 3\0"
 OWN_FIELD: Final = b"codes"
 """Name of a field that only this program's scans have."""
-STRANGERS: Final = {
-    b"version https://git-lfs": "a git-LFS pointer, not the file itself: fetch it with `git lfs pull`",
-    b"\x1f\x8b": "compressed with gzip: decompress it first (CARMEN and URG text may stay compressed as NAME.gz)",
-    b"BZh": "compressed with bzip2: decompress it first",
-    b"\xfd7zXZ": "compressed with xz: decompress it first",
-    b"\x28\xb5\x2f\xfd": "compressed with zstd: decompress it first",
-    b"7z\xbc\xaf": "a 7z archive: unpack it first",
-}
-"""Formats that are rejected by name, by their first bytes."""
 EXPECTED: Final = "MCAP, a ROS bag, CARMEN text, npz or URG text"
 
 

@@ -63,11 +63,27 @@ def test_errors_name_the_file(tmp_path, use):
     with pytest.raises(NotFoundError, match=r"gone\.mcap: no such log"):
         use(tmp_path / "gone.mcap")
     (tmp_path / "text.mcap").write_text("hello, I am not a log")
-    with pytest.raises(InputError, match=r"text\.mcap: not an MCAP log"):
+    with pytest.raises(InputError, match=r"text\.mcap: not an MCAP log$"):
         use(tmp_path / "text.mcap")
     (tmp_path / "folder.mcap").mkdir()
     with pytest.raises(InputError, match=r"folder\.mcap: a folder; `monstertruckd log list"):
         use(tmp_path / "folder.mcap")
+
+
+@pytest.mark.parametrize(
+    ("head", "named"),
+    [
+        (b"#ROSBAG V2.0\n", "not an MCAP log but a ROS 1 bag; `monstertruckd map build` reads its scans"),
+        (b"SQLite format 3\x00", "not an MCAP log but the database of a ROS 2 bag"),
+        (b"PAR1", "not an MCAP log but a Parquet table"),
+        (b"\x1f\x8b\x08", "not an MCAP log but compressed with gzip: decompress it first"),
+    ],
+)
+def test_a_log_of_another_format_is_named(tmp_path, head, named):
+    file = tmp_path / "log"
+    file.write_bytes(head + bytes(300))
+    with pytest.raises(InputError, match=named):
+        open_log(file)
 
 
 def test_log_that_died_at_birth_reads_as_empty(tmp_path):
