@@ -95,6 +95,8 @@ class PlanTask:
     """Seen ground; None if unknown: routes may reverse anywhere."""
     zones: Zones | None = None
     """Zones of the map, if newer than in the previous task."""
+    start: Pose2 | None = None
+    """Pose of the base where the path begins, as the truck is braking and comes to rest there; None for ``pose``."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -96,6 +96,8 @@ class PathPublisher:
         self._clock, self._in, self._out, self._deceleration = clock, inputs, outputs, deceleration
         self._paths = 0
         self.followed: Followed | None = None
+        self._halt: Path | None = None
+        """Path of the latest halt."""
 
     @property
     def driving(self) -> bool:
@@ -107,6 +109,17 @@ class PathPublisher:
     def displaced(self) -> bool:
         """Whether the tracker follows the path of another source."""
         return self.followed is not None and self._in.path.latest is not self.followed.message
+
+    @property
+    def rest(self) -> Pose2 | None:
+        """Pose at which the truck comes to rest on the path of ``halt``; None if it does not brake there."""
+        odometry = self._in.pose.latest
+        if self._halt is None or self._in.path.latest is not self._halt:
+            return None
+        if odometry is None or abs(odometry.twist.vx) <= AT_REST:
+            return None
+        x, y, yaw = self._halt.poses[-3:].tolist()
+        return x, y, yaw
 
     def follow(self, path: PosePath, name: str, before: float = 0.0) -> None:
         """Publish a path for the tracker to drive.
@@ -143,6 +156,8 @@ class PathPublisher:
     def halt(self, name: str) -> None:
         """Brake and stop following a path."""
         self.brake(name, halts=True)
+        if self.followed is not None and self.followed.message.halts:
+            self._halt = self.followed.message
         self.followed = None
 
     def end_other(self, name: str) -> None:

@@ -298,7 +298,7 @@ class PlanningStep:
         if self._map is None:
             return RouteAnswer(*self._without)
         places = [value for place in task.via for value in place if value is not None]
-        numbers = np.array((*task.pose, *task.goal, *places))
+        numbers = np.array((*task.pose, *(task.start or ()), *task.goal, *places))
         if not np.isfinite(numbers).all():
             return RouteAnswer(Reason.NOT_FINITE, "expected a finite pose, goal and waypoints")
         if np.abs(numbers).max() > MAX_COORDINATE:
@@ -306,6 +306,8 @@ class PlanningStep:
         if task.clear or task.afresh:
             self._route = None
         self._observe(self._setup, self._map, task)
+        if task.start is not None:
+            task = replace(task, pose=task.start)
         return self._escape(self._map, task) if task.what == "escape" else self._plan(self._map, task)
 
     def _set_up(self, setup: Setup) -> None:

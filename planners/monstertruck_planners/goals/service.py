@@ -296,7 +296,8 @@ class GoalService:
         goal, zones = None if self._goal is None else self._goal.goal, self._zone_layer()
         zone = None if goal is None else zones.keepout(self._setup.footprint, goal, self._setup.zone_margin)
         answer = None
-        if self._planning is not None and self._planning.done():
+        # A truck that is still braking would roll past the start of a route, which is where it comes to rest.
+        if self._planning is not None and self._planning.done() and self._paths.rest is None:
             answer, self._planning = self._planning.result(), None
         report = None if followed is None else followed.report(self._in.tracker.latest)
         along = 0.0 if report is None else report.along
@@ -435,6 +436,7 @@ class GoalService:
             setup=self._setup if self._fresh else None,
             grid=grid if grid is not self._sent_grid or self._fresh else None,
             ground=ground if ground is not self._sent_ground or self._fresh else None,
+            start=self._paths.rest,
             clear=plan.clear,
             afresh=plan.afresh,
             via=run.via,

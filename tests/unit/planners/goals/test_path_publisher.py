@@ -46,3 +46,24 @@ def test_a_path_cut_short_begins_where_the_truck_is(along: float):
     # What was driven counts once.
     assert publisher.followed.before == pytest.approx(along)
     assert path.along(path.start) < 0.06
+
+
+def test_a_truck_that_brakes_comes_to_rest_at_the_end_of_the_halt_path():
+    paths, tracker, newest = Outbox(), SimpleNamespace(latest=None), SimpleNamespace(latest=None)
+    twist = SimpleNamespace(vx=0.2)
+    odometry = SimpleNamespace(frame="map", pose=SimpleNamespace(x=0.3, y=0.0, yaw=0.0), twist=twist)
+    inputs = SimpleNamespace(pose=SimpleNamespace(latest=odometry), tracker=tracker, path=newest)
+    publisher = PathPublisher(SimpleNamespace(now=lambda: 0), inputs, SimpleNamespace(path=paths), 0.3)
+    publisher.follow(THERE_AND_BACK, "goal")
+    newest.latest = paths[-1]
+    tracker.latest = SimpleNamespace(path=paths[-1].name, along=0.3, outcome=Reason.DRIVING)
+    assert publisher.rest is None, "a truck that follows a route does not brake"
+    publisher.halt("halt")
+    newest.latest = paths[-1]
+    braking = 0.2**2 / (2 * 0.3)
+    assert publisher.rest is not None
+    assert 0.3 + braking <= publisher.rest[0] <= 0.3 + braking + 0.06
+    twist.vx = 0.0
+    assert publisher.rest is None, "a truck at rest sets off from its pose"
+    twist.vx, newest.latest = 0.2, object()
+    assert publisher.rest is None, "another source moves it"

@@ -12,7 +12,7 @@ from monstertruck_planners.goals import deformation
 from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_planners.goals.deform_step import DeformStep, Window
 from monstertruck_planners.goals.deformation import RouteDeformation
-from monstertruck_planners.goals.exchange import DeformTask, pose_of, twist_of
+from monstertruck_planners.goals.exchange import DeformTask, RouteAnswer, pose_of, twist_of
 from monstertruck_planners.goals.service import GoalService
 from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_runtime.errors import InputError, RequestRefusedError, WorkerError
@@ -190,3 +190,24 @@ def test_the_window_of_the_local_planner_has_them_there_too():
     task = DeformTask(scan, pose_of(odometry), stamp=odometry.stamp, twist=twist_of(odometry))
     step._observe(SimpleNamespace(lidar=lidar), task)
     assert set(np.floor(step._window.obstacles[:, 0] / 0.04).tolist()) <= {24.0, 25.0}, "cells on either side of 1 m"
+
+
+def test_a_new_route_waits_until_a_braking_truck_is_at_rest():
+    """A truck that sets off from another pose than planned misses the cusps, and covers ground nobody has checked."""
+    route = RouteAnswer(Reason.OK)
+
+    async def main() -> None:
+        service = GoalService.__new__(GoalService)
+        service._goal, service._deformation, service._setup = None, None, None
+        service._zone_layer = lambda: None
+        service._odometry = lambda _: None
+        service._in = SimpleNamespace(gate=SimpleNamespace(latest=None), slam=None)
+        service._paths = SimpleNamespace(followed=None, rest=(0.1, 0.0, 0.0))
+        service._planning = asyncio.create_task(asyncio.sleep(0, route))
+        await service._planning
+        assert service._observe(0).answer is None
+        service._paths.rest = None
+        assert service._observe(0).answer is route
+        assert service._observe(0).answer is None, "passed once"
+
+    asyncio.run(main())

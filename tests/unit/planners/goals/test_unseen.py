@@ -222,3 +222,14 @@ def test_closed_ground_beside_the_track_does_not_hold_a_truck():
     back = MotionPath(np.array([2.0, 1.5, 0.0]), np.array([[-1.0, 0.0, 0.0]]))
     assert HybridPlanner(Vehicle.truck(), HybridConfig()).free(route_map, back)
     assert points_relative(centres[:1], HERE).shape == (1, 2)
+
+
+def test_the_path_of_a_braking_truck_begins_where_it_comes_to_rest():
+    start = (HERE[0] + 0.1, HERE[1], 0.2)
+    config = PlannerConfig(route=HybridConfig(margin=0.04, effort=3000))
+    setup = Setup(config, FourWheelSteering(), FOOTPRINT, LIDAR, seen_for=30.0)
+    open_ground = grid(np.zeros((60, 100)), (0.0, 0.0), "map")
+    task = PlanTask("route", HERE, (3.5, 1.5, 0.0), np.empty((0, 2)), setup, open_ground, start=start)
+    path = PlanningStep().step(task).path
+    assert path is not None
+    assert path.poses[0] == pytest.approx(start)
