@@ -3,14 +3,14 @@
 A local map is built from the first scans, because single scans of a 4 m lidar look alike in many rooms. At every
 keyframe, its surroundings are matched to the whole saved map by branch and bound (Hess et al. 2016, section V), in
 pieces over the following scans; the next search begins at the latest keyframe. The result of a search is a hypothesis,
-which is accepted under three conditions. It fits again after some distance: in a second search or, if the search found
-no similar place, at the pose predicted from motion. Everything seen between both fits also matches the map. The beams
+which is accepted under three conditions. It fits again after some distance: in a second search or, if the search ruled
+out similar places, at the pose predicted from motion. Everything seen between both fits also matches the map. The beams
 since the first search do not contradict the saved grid. Unmapped ground fits nowhere but contradicts nothing, so a
 robot that has crossed it is found after its return.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -47,16 +47,6 @@ BROKEN: Final = frozenset({MappingEvent.APART, MappingEvent.PRUNED})
 """Events after which keyframes of the local map have moved or changed number, so that the local map restarts."""
 
 
-@dataclass
-class Hypothesis:
-    """Place found by a search, with the results of later searches for the same place."""
-
-    pose: Array
-    """Pose in the saved map of the keyframe of the latest search that found the place, shape (3,)."""
-    searches: list[tuple[int, bool]]
-    """Keyframe of every search that found the place, and whether the place was unique in it."""
-
-
 @dataclass(frozen=True, slots=True)
 class SearchResult:
     """Result of one search of the whole map."""
@@ -65,8 +55,19 @@ class SearchResult:
     """Keyframe whose surroundings were searched for."""
     pose: Array
     """Pose of that keyframe in the saved map, shape (3,)."""
-    unique: bool
+    proven: bool
+    """Whether no other place scores nearly as well, evaluated or not."""
     ambiguous: bool
+
+
+@dataclass
+class Hypothesis:
+    """Place found by a search, with the results of later searches for the same place."""
+
+    pose: Array
+    """Pose in the saved map of the keyframe of the latest search that found the place, shape (3,)."""
+    searches: list[SearchResult]
+    """Every search that found the place."""
 
 
 class GlobalLocaliser:
@@ -132,8 +133,8 @@ class GlobalLocaliser:
         """
         newest = len(self._mapper.map) - 1
         for hypothesis in self._hypotheses:
-            key, unique = hypothesis.searches[-1]
-            if not unique or not self._far_apart(key, newest, unique=True):
+            last = hypothesis.searches[-1]
+            if not last.proven or not self._far_apart(last.key, newest, proven=True):
                 continue
             numbers, led = self._surroundings(newest), self._led(hypothesis, newest)
             fit = register(self._merged(numbers, newest), self._submap.cloud, led)
@@ -141,8 +142,8 @@ class GlobalLocaliser:
                 continue
             if self._contradiction(numbers, newest, fit.pose) > MAX_CONTRADICTION[False]:
                 continue
-            there = Hypothesis(fit.pose, [*hypothesis.searches, (newest, True)])
-            if self._foreseen(there, key, unique=False):
+            there = Hypothesis(fit.pose, [*hypothesis.searches, replace(last, key=newest, pose=fit.pose)])
+            if self._foreseen(there, last.key, unique=False):
                 return fit.pose
         return None
 
@@ -153,7 +154,7 @@ class GlobalLocaliser:
     def _led(self, hypothesis: Hypothesis, key: int) -> Array:
         """Return the pose of keyframe ``key`` in the saved map that a hypothesis implies."""
         poses = self._mapper.map.poses
-        return compose(hypothesis.pose, between(poses[hypothesis.searches[-1][0]], poses[key]))
+        return compose(hypothesis.pose, between(poses[hypothesis.searches[-1].key], poses[key]))
 
     def _searched(self, stamp: int) -> Array | None:
         """Continue the search; return the pose of the latest keyframe in the map once it is certain."""
@@ -208,23 +209,24 @@ class GlobalLocaliser:
             return None
         yield Work.VERIFIED
         ambiguous = peak.rival > ambiguous_ratio * peak.score
-        unique = max(peak.rival, peak.unseen) < unique_ratio * peak.score
+        unique = peak.rival < unique_ratio * peak.score
+        proven = unique and peak.unseen < unique_ratio * peak.score
         fit = register(query, self._submap.cloud, peak.pose)
         if fit.overlap < MIN_SEARCH_OVERLAP[unique]:
             return None
         if self._contradiction(numbers, newest, fit.pose) > MAX_CONTRADICTION[unique]:
             return None
-        return SearchResult(newest, fit.pose, unique, ambiguous)
+        return SearchResult(newest, fit.pose, proven, ambiguous)
 
     def _confirmed(self, result: SearchResult) -> Array | None:
         """Compare a result with the hypotheses; return the pose of the latest keyframe if one becomes certain."""
         known = self._mapper.map
         same = next((h for h in self._hypotheses if _near(self._led(h, result.key), result.pose)), None)
         if same is None:
-            self._hypotheses.append(Hypothesis(result.pose, [(result.key, result.unique)]))
+            self._hypotheses.append(Hypothesis(result.pose, [result]))
             return None
         same.pose = result.pose
-        same.searches.append((result.key, result.unique))
+        same.searches.append(result)
         since = self._far_enough(same)
         if since is None or not self._foreseen(same, *since):
             return None
@@ -233,17 +235,18 @@ class GlobalLocaliser:
     def _far_enough(self, hypothesis: Hypothesis) -> tuple[int, bool] | None:
         """Return the last search far enough from the latest one for certainty; None without one.
 
-        The result holds its keyframe, and whether both searches found the place unique.
+        The result holds its keyframe, and whether both searches proved the place unique.
         """
-        newest, unique = hypothesis.searches[-1]
-        for key, also in reversed(hypothesis.searches):
-            if self._far_apart(key, newest, unique=unique and also):
-                return key, unique and also
+        newest = hypothesis.searches[-1]
+        for earlier in reversed(hypothesis.searches):
+            proven = newest.proven and earlier.proven
+            if self._far_apart(earlier.key, newest.key, proven=proven):
+                return earlier.key, proven
         return None
 
-    def _far_apart(self, key: int, newest: int, *, unique: bool) -> bool:
-        """Whether two fits are far enough apart for certainty: both unique, or at most one of them."""
-        return self._ways[newest] - self._ways[key] >= (0.8 if unique else 3.0)
+    def _far_apart(self, key: int, newest: int, *, proven: bool) -> bool:
+        """Whether two fits are far enough apart for certainty: both proven unique, or at most one of them."""
+        return self._ways[newest] - self._ways[key] >= (0.8 if proven else 3.0)
 
     def _foreseen(self, hypothesis: Hypothesis, since: int, unique: bool) -> bool:
         """Whether everything seen since keyframe ``since`` fits the map, and nothing since the first search refutes it.
@@ -251,11 +254,11 @@ class GlobalLocaliser:
         No single stretch may contradict the map either: a robot may soon leave a room that only looks like a mapped
         one.
         """
-        centre, newest = hypothesis.searches[-1][0], len(self._mapper.map) - 1
+        centre, newest = hypothesis.searches[-1].key, len(self._mapper.map) - 1
         query = self._merged(np.arange(since, newest + 1), centre)
         if measure(query, self._submap.cloud, hypothesis.pose).overlap < MIN_SEARCH_OVERLAP[unique]:
             return False
-        numbers = np.arange(hypothesis.searches[0][0], newest + 1)
+        numbers = np.arange(hypothesis.searches[0].key, newest + 1)
         stretches = np.array_split(numbers, math.ceil(len(numbers) / QUERY_KEYS))
         if any(self._contradiction(some, centre, hypothesis.pose) > MAX_CONTRADICTION[1] for some in stretches):
             return False

@@ -10,6 +10,7 @@ import pytest
 from monstertruck_estimation.slam import global_search, localisation
 from monstertruck_estimation.slam.budget import ScanBudget
 from monstertruck_estimation.slam.config import MapperConfig
+from monstertruck_estimation.slam.correlation import correlation
 from monstertruck_estimation.slam.localisation import LocalisationEstimator
 from monstertruck_estimation.slam.scan_matcher import MatchStatus, ScanMatch
 from monstertruck_estimation.slam.scans import prepare_input
@@ -67,6 +68,23 @@ def test_a_place_without_a_rival_is_found_where_a_fifth_of_the_beams_contradict_
     estimates = followed(SavedMap(drawn(), None), [*EMPTY, *box(-1.0, -0.6, 0.4, 0.7)], truth)
     assert estimates[-1].status in PLACED
     assert math.hypot(*(np.array(estimates[-1].pose) - truth[-1])[:2]) < 0.1
+
+
+@pytest.fixture
+def ended_early(monkeypatch: pytest.MonkeyPatch):
+    """Makes every search for rivals end before it has ruled them out."""
+
+    def cut(*arguments):
+        peak = yield from correlation(*arguments)
+        return peak and replace(peak, unseen=peak.score)
+
+    monkeypatch.setattr(global_search, "correlation", cut)
+
+
+@pytest.mark.usefixtures("ended_early")
+def test_a_place_that_fits_without_proof_of_its_uniqueness_is_not_outside():
+    estimates = followed(SavedMap(drawn(), None), [*EMPTY, *box(-1.0, -0.6, 0.3, 0.5)], rounds(160, laps=1.0))
+    assert {estimate.status for estimate in estimates} == {LocalisationStatus.SEARCHING}
 
 
 @pytest.mark.parametrize("odom", [True, False])
