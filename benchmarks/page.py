@@ -43,6 +43,11 @@ FRAMES = """
 """
 
 
+async def published(endpoint: str, times: int) -> asyncio.subprocess.Process:
+    """Start the robot that only publishes, with messages ``times`` as fast."""
+    return await spawned("benchmarks.station_parts.published", endpoint, "truck", str(times), ready="ready")
+
+
 async def smoothness(page: Page, session: CDPSession, seconds: float) -> dict[str, float]:
     """Frames a second, the 99 % gap between two (ms), and how much of the slower processor the page's thread needs.
 
@@ -80,8 +85,7 @@ async def main(plots: int, seconds: float, minutes: float) -> int:
     pinned = [[name] for name in numbers() if name.startswith(TOPICS)][:plots]
     async with AsyncExitStack() as stack:
         folder = stack.enter_context(TemporaryDirectory())
-        words = (endpoint, "truck", str(TIMES if minutes else 1))
-        robot = await spawned("benchmarks.station_parts.published", *words, ready="ready")
+        robot = await published(endpoint, 1)
         stack.push_async_callback(ended, robot)
         words = ("--robot", f"truck@{endpoint}", "--port", port)
         stack.push_async_callback(ended, await spawned("monstertruckd", "station", *words, ready="station:"))
@@ -98,6 +102,9 @@ async def main(plots: int, seconds: float, minutes: float) -> int:
         figures: dict[str, Any] = {"load_average": round(os.getloadavg()[0], 1), "plots": len(pinned)}
         figures |= await smoothness(page, session, seconds)
         if minutes:
+            await ended(robot)
+            stack.push_async_callback(ended, await published(endpoint, TIMES))
+            await asyncio.sleep(3.0)
             heaps = []
             for _ in range(20):
                 await asyncio.sleep(3 * minutes)
