@@ -247,10 +247,13 @@ class ObstacleGuard:
             self._checked = rounded
             self._update_unseen(rounded)
             points, remembered, echoes = self._points, self.memory.points(), self.memory.echoes()
+            nearer = self.memory.nearer()
             if self._dock is not None:
                 outside = self._dock.outside
+                nearer = nearer[outside(remembered)]
                 points, remembered, echoes = (some[outside(some)] for some in (points, remembered, echoes))
-            self._free = min(self._free_distance(*twist, points, remembered, echoes) for twist in rounded)
+            by_doubt = {doubt: remembered[nearer == doubt] for doubt in np.unique(nearer).tolist()}
+            self._free = min(self._free_distance(*twist, points, by_doubt, echoes) for twist in rounded)
             self._check_ground(rounded, np.concatenate((points, remembered)))
         return self._free
 
@@ -278,7 +281,9 @@ class ObstacleGuard:
         views = [eye.visibility for eye in self._eyes]
         return _Sweep(distances, poses, ground, before, travelled(views, self._footprint, ground))
 
-    def _free_distance(self, x: int, y: int, turn: int, points: Array, remembered: Array, echoes: Array) -> float:
+    def _free_distance(
+        self, x: int, y: int, turn: int, points: Array, remembered: Mapping[float, Array], echoes: Array
+    ) -> float:
         sweep = self._sweep(x, y, turn)
         clearance = self._limits.config.obstacle.side_clearance
         leaving = LEAVING * sweep.distances
@@ -286,10 +291,11 @@ class ObstacleGuard:
         if x < 0 and not _on_the_spot(x, y):
             contacts.append(first_contact(self._footprint, sweep.poses, echoes, clearance, leaving))
         free = [float(sweep.distances[contact - 1]) for contact in contacts if contact is not None]
-        # Without clearance: their positions may be off by as much.
-        known = first_contact(self._footprint, sweep.poses, remembered, -self._footprint.padding)
-        if known is not None:
-            free.append(max(float(sweep.distances[known - 1]) - self.memory.unsure, 0.0))
+        for nearer, those in remembered.items():
+            # Without clearance: their positions may be off by as much.
+            known = first_contact(self._footprint, sweep.poses, those, -self._footprint.padding)
+            if known is not None:
+                free.append(max(float(sweep.distances[known - 1]) - nearer, 0.0))
         return min(free, default=math.inf)
 
     def _check_ground(self, twists: frozenset[_Steps], measured: Array) -> None:

@@ -160,10 +160,10 @@ class ScanMemory:
         for eye in self._eyes:
             eye.forget()
         self._heard: dict[str, _Heard] = {}
-        self._points = np.empty((0, 2))
+        self._points, self._nearer = np.empty((0, 2)), np.empty(0)
         self.unsure = 0.0
         """Greatest growth of the doubt about the travelled distance since a valid view, beyond the padding of the
-        footprint, m: the body may be that much nearer to what it remembers."""
+        footprint, m: the body may be that much nearer to unseen ground."""
 
     def move(self, now: int, twist: Twist2, dt: float, doubt: float = 0.0) -> None:
         """Move the body.
@@ -226,9 +226,12 @@ class ScanMemory:
         elif stood[-1:] == [True] or not stood or travelled - taken[-1].travelled >= memory_step:
             taken.append(self._newest)
         _keep(eye.views, self._newest)
-        grown = [abs(self._travel_doubt - view.doubt) for view in self._seeing(self._newest)]
-        self.unsure = max(max(grown, default=math.inf) - self._footprint.padding, 0.0)
-        self._points = self._hidden(self._newest)
+        self.unsure = max(map(self._doubt_since, self._seeing(self._newest)), default=math.inf)
+        self._points, self._nearer = self._hidden(self._newest)
+
+    def _doubt_since(self, view: _Taken) -> float:
+        """Growth of the doubt about the travelled distance since a view, beyond the padding of the footprint (m)."""
+        return max(abs(self._travel_doubt - view.doubt) - self._footprint.padding, 0.0)
 
     def moved(self, points: Array, lidar: int) -> Array:
         """Transform points of ``lidar`` to the base frame at the latest of all scans.
@@ -288,11 +291,19 @@ class ScanMemory:
         """
         return self._points
 
-    def _hidden(self, newest: _Taken) -> Array:
-        """See ``points``."""
+    def nearer(self) -> Array:
+        """Return how much nearer the body may be to each of ``points``, shape (n,), m.
+
+        That is the growth of the doubt about the travelled distance since the point was seen, beyond the padding.
+        """
+        return self._nearer
+
+    def _hidden(self, newest: _Taken) -> tuple[Array, Array]:
+        """See ``points`` and ``nearer``."""
         taken = self._fresh((scan for eye in self._eyes for scan in eye.taken), newest)
-        kept = [scan.points for scan in taken if newest.travelled - scan.travelled < self._distance]
-        there = np.concatenate((newest.points[:0], *kept))
+        kept = [scan for scan in taken if newest.travelled - scan.travelled < self._distance]
+        there = np.concatenate((newest.points[:0], *(scan.points for scan in kept)))
+        nearer = np.repeat([self._doubt_since(scan) for scan in kept], [len(scan.points) for scan in kept])
         looked = np.zeros(len(there), np.bool_)
         for scan in self._latest():
             beams = _beams((scan,), there)[0][0]
@@ -302,7 +313,8 @@ class ScanMemory:
             inside = np.append(scan.beams.inside(field_edge), False)
             looked |= inside[np.minimum(beams, len(inside) - 1)]
         points = points_relative(there[~looked], newest.pose)
-        return points[~on_body(self._footprint, points, 0.0)]
+        outside = ~on_body(self._footprint, points, 0.0)
+        return points[outside], nearer[~looked][outside]
 
     def echoes(self) -> Array:
         """Points on the latest arcs of all sonars (m), in the base frame at the latest scan, shape (n, 2)."""

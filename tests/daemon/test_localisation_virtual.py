@@ -68,7 +68,7 @@ def test_a_damaged_save_is_named_and_the_one_before_is_read_if_it_is_whole(tmp_p
         assert drive.health
         assert (slam.state, slam.reason) == (ServiceState.READY, Reason.FILE_DAMAGED)
     else:
-        assert (slam.state, slam.restarts, slam.reason) == (ServiceState.FAILED, 0, Reason.BAD_INPUT)
+        assert (slam.state, slam.restarts, slam.reason) == (ServiceState.FAILED, 0, Reason.FILE_DAMAGED)
         assert slam.detail.count("as in manifest.json") == 2
         assert "Traceback" not in slam.detail
 

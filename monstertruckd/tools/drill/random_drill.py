@@ -353,6 +353,7 @@ async def _react(truck: DrillTruck, fault: CatalogFault, cruise: float, order: O
     if blocked:
         blockers = ()
     drove_on = standstill is not None and standstill > fault.hold  # the truck stood only because it was disarmed
+    backs_off = reason is Reason.CONTACT  # after a contact the robot stays armed, and moves again to leave the obstacle
     return FaultOutcome(
         fault.name,
         fault.kind,
@@ -364,7 +365,7 @@ async def _react(truck: DrillTruck, fault: CatalogFault, cruise: float, order: O
         recovered_s=None if blockers else recovered,
         stuck=blockers,
         blocked=blocked,
-        violations=observer.violations(),
+        violations=tuple(one for one in observer.violations() if not (backs_off and one.rule == "unarmed")),
     )
 
 

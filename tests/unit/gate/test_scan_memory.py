@@ -640,6 +640,25 @@ def test_remembered_obstacles_are_nearer_by_the_doubt_about_the_travelled_distan
     assert beside(10.0) == 0.0
 
 
+def test_a_remembered_obstacle_is_nearer_only_by_the_doubt_since_it_was_seen():
+    def beside(doubt):
+        guard, now = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, [ScanPoints(MOUNT)]), SECOND
+        guard.observe(scan(now))
+        for target in (None, (0.3, 0.35)):
+            for _ in range(120):
+                now += TICK
+                guard.move(now, (0.2, 0.0, 0.0), 0.02, doubt)
+            guard.observe(scan(now) if target is None else scan(now, target))
+        for _ in range(120):
+            now += TICK
+            guard.move(now, (0.2, 0.0, 0.0), 0.02, doubt)
+        guard.observe(scan(now))
+        assert (guard.memory.unsure > 0.0) is (doubt > 0.0)
+        return guard.free_distance(((0.0, 1.0, 0.0),))
+
+    assert 0.1 < beside(0.5) == beside(0.0) < 0.3
+
+
 def test_ahead_the_gate_slows_down_a_tail_that_swings_towards_unseen_ground():
     assert Reason.UNSEEN_SLOW in surround(Rig()).driving(speed=0.15, rear=0.4, ticks=20).out.reasons
 
