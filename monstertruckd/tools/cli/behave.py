@@ -47,7 +47,9 @@ def list_command(
 @app.command("start")
 def start_command(
     name: NameArgument,
-    arm: Annotated[bool, typer.Option("--arm", help="Arm the robot first; it starts to drive at once.")] = False,
+    arm: Annotated[
+        bool, typer.Option("--arm", help="Arm the robot first; the robot starts to drive immediately.")
+    ] = False,
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
     json_output: JsonOption = False,

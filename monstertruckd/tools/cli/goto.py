@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 ROUTE_TIMEOUT: Final = 6.0
 """Timeout for the first route (s)."""
 
-ArmOption = Annotated[bool, typer.Option("--arm", help="Also arm the robot; it starts to drive at once.")]
+ArmOption = Annotated[bool, typer.Option("--arm", help="Also arm the robot; the robot starts to drive immediately.")]
 
 
 PathArgument = Annotated[

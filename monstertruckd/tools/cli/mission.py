@@ -34,7 +34,9 @@ def run_command(
     moved: Annotated[
         bool, typer.Option("--moved", help="Resume even though the robot was moved; its pose is known to be right.")
     ] = False,
-    arm: Annotated[bool, typer.Option("--arm", help="Arm the robot first; it starts to drive at once.")] = False,
+    arm: Annotated[
+        bool, typer.Option("--arm", help="Arm the robot first; the robot starts to drive immediately.")
+    ] = False,
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
     json_output: JsonOption = False,

@@ -43,7 +43,9 @@ class MoveCommand(ModelCommand):
 
 def move(
     context: typer.Context,
-    arm: Annotated[bool, typer.Option("--arm", help="Arm the robot first; it drives off at once.")] = False,
+    arm: Annotated[
+        bool, typer.Option("--arm", help="Arm the robot first; the robot starts to drive immediately.")
+    ] = False,
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
     json_output: JsonOption = False,

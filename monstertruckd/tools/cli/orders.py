@@ -91,7 +91,10 @@ async def _announce(client: "TruckClient", *, hold: bool) -> None:
         if row.expired:
             remark(f"calibration of {row.wizard} has expired ({row.expired}): monstertruckd calibrate {row.wizard}")
     if not hold and (names := await _set_off(client, await client.get_retained(GATE))):
-        print(f"will start to drive at once: {', '.join(names)}; --hold arms without starting", file=sys.stderr)
+        print(
+            f"arming starts these sources: {', '.join(names)}; --hold arms without starting them",
+            file=sys.stderr,
+        )
 
 
 async def _set_off(client: "TruckClient", gate: "GateState | None") -> list[str]:

@@ -161,7 +161,7 @@ def test_arming_says_who_drives_or_waits(monkeypatch: pytest.MonkeyPatch, capsys
 def test_who_sets_off_is_said_before_arming(capsys: pytest.CaptureFixture[str]):
     waiting = state(GateMode.DISARMED).model_copy(update={"waiting": ("tracker",)})
     asyncio.run(orders._announce(Robot(waiting, waiting), hold=False))  # type: ignore[arg-type]
-    assert capsys.readouterr().err == "will start to drive at once: tracker; --hold arms without starting\n"
+    assert capsys.readouterr().err == "arming starts these sources: tracker; --hold arms without starting them\n"
     for newest in (state(GateMode.DISARMED), None):
         asyncio.run(orders._announce(Robot(waiting, newest), hold=False))  # type: ignore[arg-type]
     assert capsys.readouterr().err == ""
@@ -174,13 +174,13 @@ def test_who_sets_off_is_said_before_arming(capsys: pytest.CaptureFixture[str]):
             GateMode.DISARMED,
             False,
             "lap",
-            "will start to drive at once: tracker, along path 'lap' of 14.0 m; --hold arms without starting\n",
+            "arming starts these sources: tracker, along path 'lap' of 14.0 m; --hold arms without starting them\n",
         ),
         (
             GateMode.DISARMED,
             False,
             "",
-            "will start to drive at once: tracker, along its path of 14.0 m; --hold arms without starting\n",
+            "arming starts these sources: tracker, along its path of 14.0 m; --hold arms without starting them\n",
         ),
         (GateMode.DISARMED, True, "lap", ""),
         (GateMode.ARMED, False, "lap", ""),
