@@ -8,7 +8,7 @@ from pydantic import TypeAdapter
 
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.catalog import AnyTracker, build_tracker
-from monstertruck_planners.track.path_tracker import TruckState
+from monstertruck_planners.track.path_tracker import EXACT, TruckState
 from monstertruck_planners.track.segments import SegmentedPath
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.plan import Path
@@ -51,9 +51,10 @@ def figure_eight(size=1.5, count=240):
 
 
 class Follower:
-    """A truck driven by a tracker at 20 Hz."""
+    """A truck driven by a tracker at 20 Hz, whose axles turn and slip by ``errors``."""
 
-    def __init__(self, route, pose=(0.0, 0.0, 0.0), **config):
+    def __init__(self, route, pose=(0.0, 0.0, 0.0), *, errors=EXACT, **config):
+        self.errors = errors
         self.config = TRACKER.validate_python({"kind": "pure_pursuit"} | config)
         self.tracker = build_tracker(self.config, STEERING)
         self.pose = pose
@@ -65,7 +66,7 @@ class Follower:
         self.clearance = math.inf
 
     def step(self):
-        twist = STEERING.body_twist(self.speed, self.front, self.rear)
+        twist = self.twist()
         command = self.tracker.control(
             TruckState(self.pose, twist[0], self.clearance), self.path, self.progress, self.t
         )
@@ -76,8 +77,12 @@ class Follower:
             self.front += float(np.clip(command.front - self.front, -0.01, 0.01))
             self.rear += float(np.clip(command.rear - self.rear, -0.01, 0.01))
             self.speed += float(np.clip(command.speed - self.speed, -0.01, 0.01))
-            self.pose = STEERING.integrate(self.pose, *STEERING.body_twist(self.speed, self.front, self.rear), 0.01)
+            self.pose = STEERING.integrate(self.pose, *self.twist(), 0.01)
         return command
+
+    def twist(self):
+        wheels = self.errors.wheels((self.front, self.rear), self.speed**2 / STEERING.wheelbase)
+        return STEERING.body_twist(self.speed, *wheels)
 
     def run(self, seconds=200.0):
         """Until the path ends; the outcome."""

@@ -9,6 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from monstertruck_planners.route.motion import MotionPath
+from monstertruck_planners.track.axle_errors import AxleError, AxleErrors
 from monstertruck_planners.track.catalog import TRACKERS, build_tracker
 from monstertruck_planners.track.config import TrackerConfig
 from monstertruck_planners.track.mpc import Solver
@@ -59,6 +60,18 @@ def test_curves_leave_no_error(kind, mode, direction):
     truck = Follower(path(route, [direction] * len(route)), kind=kind, steering=mode)
     assert truck.run() is Reason.GOAL_REACHED
     assert truck.cross_track(after=1.5).max() < 0.012
+
+
+@pytest.mark.parametrize("mode", ["front", "counter", "hybrid"])
+@pytest.mark.parametrize("kind", EXACT)
+def test_a_known_slip_of_the_axles_leaves_no_error_and_no_oscillation(kind, mode):
+    slip = AxleErrors(AxleError(compliance=0.06), AxleError(compliance=0.04))
+    limits = {"speed": 1.5, "acceleration": 1.2, "lateral_acceleration": 1.5}
+    truck = Follower(path(circle(2.0, turns=1.0)), errors=slip, kind=kind, steering=mode, **limits)
+    truck.tracker.axle_errors.errors = slip
+    assert truck.run() is Reason.GOAL_REACHED
+    assert max(c.speed for c in truck.log) > 1.4
+    assert truck.cross_track(after=5.0).max() < 0.02
 
 
 @pytest.mark.parametrize("kind", KINDS)
