@@ -55,7 +55,7 @@ def test_the_stored_run_has_all_there_is_to_compute():
     assert {"goal-1", "goal-1-deformed", "halt-1", "goal-2"} <= kinds
     asked = [entry for entry in open_log(GOALS) if entry.topic == "req/goal"]
     assert len(asked) == 1  # and the other one by remote call
-    assert GOALS.stat().st_size < 540_000
+    assert GOALS.stat().st_size < 600_000
 
 
 class NotedTurns(Pace):
