@@ -94,7 +94,7 @@ class ReplayFeed:
         file: log file.
         open_log: function that opens logs.
         clock: clock of the station.
-        growing: whether the robot was still writing the log: a missing end is no damage then.
+        growing: whether the robot was still writing the log, so that the log may lack its end without being damaged.
 
     Raises:
         InputError: the file is not a log, contains nothing to show, or is too large.
